@@ -1,0 +1,34 @@
+//! Decoders of compressed value blocks: bytes in, bytes out.
+//!
+//! A `.vdb` file compresses the values of each leaf and inner node on their own, with zlib or as a Blosc
+//! chunk. The functions here turn one such block back into exactly the bytes that the caller expects, and
+//! take no more memory than that (plus a constant), whatever the block claims about itself.
+//!
+//! What the bytes mean, which codec a grid uses and where a block starts and ends is none of their business:
+//! the readers of files and grids know that.
+
+pub(crate) mod blosc;
+mod blosclz;
+mod shuffle;
+pub(crate) mod zlib;
+
+/// Why a block could not be decoded. The caller knows the block's offset and adds it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum CodecError {
+    /// The block breaks the rules of its format, or decodes to another size than it should.
+    Malformed(&'static str),
+    /// The block may be sound but uses a feature that is not read here.
+    Unsupported(&'static str),
+}
+
+/// Buffers and decoder states that outlive a block.
+///
+/// Grids hold tens of thousands of blocks of 2 KiB, so that setting these up for each would cost more than
+/// decoding it. One per thread; what is left in it never changes what the next block decodes to.
+#[derive(Default)]
+pub(crate) struct Scratch {
+    /// A Blosc block before its shuffle is undone.
+    shuffled: Vec<u8>,
+    inflate: Option<flate2::Decompress>,
+    zstd: Option<ruzstd::decoding::FrameDecoder>,
+}

@@ -1,0 +1,109 @@
+//! Every float grid of the test data against what OpenVDB says of it.
+
+use nuage_testkit as testkit;
+use nuage_vdb::{File, GridInfo, Tree};
+use serde_json::Value;
+
+#[test]
+fn every_float_grid_equals_the_truth() {
+    let (mut files, mut grids) = (0, 0);
+    for (path, truth) in testkit::truths() {
+        let file = File::open(std::fs::read(&path).unwrap())
+            .unwrap_or_else(|e| panic!("{}: {e}", path.display()));
+        assert_eq!(u64::from(file.file_version), truth["file_version"].as_u64().unwrap());
+        let [major, minor] = file.library_version;
+        assert_eq!(format!("{major}.{minor}"), truth["library_version"].as_str().unwrap());
+        check_metadata(&file.metadata, &truth["file_metadata"]);
+        let wanted = truth["grids"].as_array().unwrap();
+        assert_eq!(file.grids.len(), wanted.len(), "{}", path.display());
+        files += 1;
+        for want in wanted {
+            let name = want["unique_name"].as_str().unwrap();
+            let context = format!("{} {name}", path.display());
+            let index = file.grids.iter().position(|g| g.unique_name == name).expect(&context);
+            let info = &file.grids[index];
+            check_header(info, want, &context);
+            if want["grid_type"] == "Tree_float_5_4_3" {
+                let grid = file.read_grid(index).unwrap_or_else(|e| panic!("{context}: {e}"));
+                check_tree(&grid.tree, want, &context);
+                grids += 1;
+            } else {
+                let refused = file.read_grid(index).map(|_| ());
+                assert!(matches!(refused, Err(nuage_vdb::Error::Unsupported { .. })), "{context}: {refused:?}");
+            }
+        }
+    }
+    assert!(files >= 40 && grids >= 60, "only {grids} float grids in {files} files were found");
+}
+
+fn check_metadata(metadata: &nuage_vdb::Metadata, want: &Value) {
+    let want = want.as_object().unwrap();
+    let names: Vec<&str> = metadata.iter().map(|(name, _)| name).collect();
+    assert_eq!(names, want.keys().map(String::as_str).collect::<Vec<_>>());
+    for (name, value) in metadata.iter() {
+        assert_eq!(value.type_name, want[name]["type"].as_str().unwrap(), "{name}");
+        // The truth files spell each byte as the character of that number.
+        let text: String = value.text_bytes().iter().map(|b| char::from(*b)).collect();
+        assert_eq!(text, want[name]["str"].as_str().unwrap(), "{name}");
+    }
+}
+
+fn check_header(info: &GridInfo, want: &Value, context: &str) {
+    assert_eq!(info.name, want["name"].as_str().unwrap(), "{context}");
+    assert_eq!(info.grid_type, want["grid_type"].as_str().unwrap(), "{context}");
+    assert_eq!(info.grid_class(), want["grid_class"].as_str().unwrap(), "{context}");
+    assert_eq!(info.save_float_as_half, want["save_float_as_half"].as_bool().unwrap(), "{context}");
+    check_metadata(&info.metadata, &want["metadata"]);
+    let transform = &want["transform"];
+    assert_eq!(info.transform.type_name, transform["type"].as_str().unwrap(), "{context}");
+    assert_eq!(info.transform.matrix().is_some(), transform["linear"].as_bool().unwrap(), "{context}");
+    let close = |got: f64, want: f64| (got - want).abs() <= 1e-9 * want.abs().max(1.0);
+    let floats = |v: &Value| v.as_array().unwrap().iter().map(|x| x.as_f64().unwrap()).collect::<Vec<_>>();
+    if let Some(matrix) = info.transform.matrix() {
+        assert_eq!(matrix.as_flattened(), floats(&transform["mat4_row_vector"]), "{context}");
+    }
+    for (got, want) in info.transform.voxel_size().iter().zip(floats(&transform["voxel_size"])) {
+        assert!(close(*got, want), "{context}: voxel size {got}, not {want}");
+    }
+    for pair in transform["index_to_world"].as_array().unwrap() {
+        let index: [f64; 3] = floats(&pair[0]).try_into().unwrap();
+        for (got, want) in info.transform.world_from_index(index).iter().zip(floats(&pair[1])) {
+            assert!(close(*got, want), "{context}: {index:?} at {got}, not {want}");
+        }
+    }
+}
+
+fn check_tree(tree: &Tree, want: &Value, context: &str) {
+    let number = testkit::number;
+    let value = |v: &Value| f64::from(number(v) as f32);
+    assert!(testkit::same(f64::from(tree.background), value(&want["background"])), "{context}");
+    let stats = tree.statistics();
+    let boxed = |v: &Value| serde_json::from_value::<Option<[[i32; 3]; 2]>>(v.clone()).unwrap();
+    assert_eq!(stats.active_voxels, want["active_voxels"].as_u64().unwrap(), "{context}");
+    assert_eq!(stats.active_tiles, want["active_tiles"].as_u64().unwrap(), "{context}");
+    assert_eq!(stats.active_bbox, boxed(&want["active_bbox"]), "{context}");
+    assert_eq!(stats.leaf_bbox, boxed(&want["leaf_bbox"]), "{context}");
+    let counts: [u64; 4] = serde_json::from_value(want["node_counts_leaf_to_root"].clone()).unwrap();
+    assert_eq!(stats.node_counts_leaf_to_root, counts, "{context}");
+    let hex = |hash: u64| format!("{hash:016x}");
+    assert_eq!(hex(tree.topology_hash()), want["fnv1a64_topology"].as_str().unwrap(), "{context}");
+    let hash_holds_a_nan = tree.leaves.values.iter().any(|v| v.is_nan());
+    if !hash_holds_a_nan {
+        assert_eq!(hex(tree.leaf_value_hash()), want["fnv1a64_leaf_values"].as_str().unwrap(), "{context}");
+    }
+    match stats.min_max {
+        Some([min, max]) => {
+            assert_eq!(f64::from(min), value(&want["min"]), "{context}");
+            assert_eq!(f64::from(max), value(&want["max"]), "{context}");
+            assert_eq!(stats.nan_count, want["nan_count"].as_u64().unwrap(), "{context}");
+        }
+        None => assert!(want.get("min").is_none(), "{context}"),
+    }
+    for probe in want["probes"].as_array().unwrap() {
+        let ijk: [i32; 3] = serde_json::from_value(probe["ijk"].clone()).unwrap();
+        let voxel = tree.voxel(ijk);
+        assert!(testkit::same(f64::from(voxel.value), value(&probe["v"])), "{context} {ijk:?}: {voxel:?}");
+        assert_eq!(voxel.active, probe["on"].as_bool().unwrap(), "{context} {ijk:?}");
+        assert_eq!(i64::from(voxel.depth), probe["depth"].as_i64().unwrap(), "{context} {ijk:?}");
+    }
+}
