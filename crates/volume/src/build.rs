@@ -1,0 +1,356 @@
+//! Building a packed tree from bricks and tiles.
+//!
+//! The builder collects regions in ordered maps, adds entries for zero regions that touch others, computes
+//! every footprint, and flattens the maps into the arrays of [`Tree`].
+
+use std::collections::BTreeMap;
+
+use glam::IVec3;
+
+use crate::brick::{Bounds, BrickSummary, Bricks};
+use crate::space::{
+    LOG2_NODE4_BRICKS, LOG2_NODE5_BRICKS, NODE4_SLOTS, NODE5_SLOTS, node4_slot, node4_slot_brick, node5_slot,
+    node5_slot_brick, root_cell,
+};
+use crate::tree::{Entry, MaskWord, Nodes, RootEntry, Tree};
+
+/// Why a tree cannot be built.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum BuildError {
+    /// More bricks or entries than 32-bit indices can name.
+    #[error("the volume needs {what}, more than {limit}")]
+    Limit {
+        /// What there are too many of.
+        what: &'static str,
+        /// How many there may be.
+        limit: u64,
+    },
+    /// Two regions were given for the same place.
+    #[error("two regions overlap at index {0}")]
+    Overlap(IVec3),
+}
+
+/// The size of a tile.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum TileSize {
+    /// 8³ voxels.
+    Brick,
+    /// 128³ voxels.
+    Node4,
+    /// 4096³ voxels.
+    Node5,
+}
+
+/// Collects the regions of a tree. Values must be finite.
+#[derive(Debug, Default)]
+pub struct TreeBuilder {
+    root: BTreeMap<[i32; 3], Slot<Node5>>,
+    summaries: Vec<BrickSummary>,
+}
+
+type Node5 = BTreeMap<u16, Slot<Node4>>;
+type Node4 = Box<[Leaf]>;
+
+/// One value, or a child.
+#[derive(Debug)]
+enum Slot<T> {
+    Tile(f32),
+    Child(T),
+}
+
+/// What stands in a slot of a `Node4`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Leaf {
+    Absent,
+    Tile(f32),
+    Brick(u32),
+}
+
+const ZERO: Bounds = Bounds { min: 0.0, max: 0.0 };
+/// Index coordinates have 32 bits, so brick coordinates lie in `-BRICK_END..BRICK_END`.
+const BRICK_END: i32 = 1 << 28;
+/// Entries and bricks are named by 32 bits, of which one value is taken.
+const INDEX_LIMIT: usize = u32::MAX as usize;
+
+/// The step to the next brick along the axes of a bit set `x << 2 | y << 1 | z`.
+fn step(axes: usize) -> IVec3 {
+    IVec3::new((axes >> 2 & 1) as i32, (axes >> 1 & 1) as i32, (axes & 1) as i32)
+}
+
+impl TreeBuilder {
+    /// A builder of an empty tree.
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// Adds a brick at a brick coordinate. The n-th brick added is the n-th of the array given to
+    /// [`TreeBuilder::finish`].
+    ///
+    /// # Errors
+    /// If something is there already.
+    pub fn brick(&mut self, brick: IVec3, summary: BrickSummary) -> Result<(), BuildError> {
+        let index = self.summaries.len() as u32;
+        self.summaries.push(summary);
+        self.leaf(brick, Leaf::Brick(index))
+    }
+
+    /// Adds a region of one value around a brick: the aligned cube of that size.
+    ///
+    /// # Errors
+    /// If something is there already.
+    pub fn tile(&mut self, brick: IVec3, size: TileSize, value: f32) -> Result<(), BuildError> {
+        let cell = root_cell(brick).to_array();
+        let replaced = match size {
+            TileSize::Node5 => self.root.insert(cell, Slot::Tile(value)).is_some(),
+            TileSize::Node4 => match self.root.entry(cell).or_insert_with(|| Slot::Child(Node5::new())) {
+                Slot::Tile(_) => true,
+                Slot::Child(node5) => node5.insert(node5_slot(brick) as u16, Slot::Tile(value)).is_some(),
+            },
+            TileSize::Brick => return self.leaf(brick, Leaf::Tile(value)),
+        };
+        if replaced { Err(BuildError::Overlap(brick << 3)) } else { Ok(()) }
+    }
+
+    fn leaf(&mut self, brick: IVec3, leaf: Leaf) -> Result<(), BuildError> {
+        let overlap = BuildError::Overlap(brick << 3);
+        let node5 = self.root.entry(root_cell(brick).to_array());
+        let Slot::Child(node5) = node5.or_insert_with(|| Slot::Child(Node5::new())) else {
+            return Err(overlap);
+        };
+        let node4 = node5.entry(node5_slot(brick) as u16);
+        let absent = || Slot::Child(vec![Leaf::Absent; NODE4_SLOTS].into());
+        let Slot::Child(node4) = node4.or_insert_with(absent) else { return Err(overlap) };
+        match std::mem::replace(&mut node4[node4_slot(brick)], leaf) {
+            Leaf::Absent => Ok(()),
+            _ => Err(overlap),
+        }
+    }
+
+    /// The tree. `bricks` holds the values of the bricks in the order in which they were added.
+    ///
+    /// # Errors
+    /// If there are more bricks or entries than indices.
+    ///
+    /// # Panics
+    /// If `bricks` holds another number of bricks than were added.
+    pub fn finish(mut self, bricks: Bricks) -> Result<Tree, BuildError> {
+        assert_eq!(bricks.len(), self.summaries.len(), "one array entry per brick added");
+        if bricks.len() >= INDEX_LIMIT {
+            return Err(BuildError::Limit { what: "bricks", limit: INDEX_LIMIT as u64 });
+        }
+        for (brick, log2_bricks, axes) in self.regions_before_others() {
+            self.add_zero_region(brick, log2_bricks, axes);
+        }
+        let mut tree = Tree { root: Vec::new(), node5: Nodes::default(), node4: Nodes::default(), bricks };
+        for (cell, slot) in &self.root {
+            let cell = IVec3::from_array(*cell);
+            let brick = cell << LOG2_NODE5_BRICKS;
+            let (entry, footprint) = match slot {
+                Slot::Tile(value) => (Entry::constant(*value), self.footprint(brick, LOG2_NODE5_BRICKS)),
+                Slot::Child(node5) => self.flatten_node5(node5, brick, &mut tree)?,
+            };
+            tree.root.push(RootEntry { cell, entry, footprint });
+        }
+        Ok(tree)
+    }
+
+    fn flatten_node5(
+        &self,
+        node5: &Node5,
+        first_brick: IVec3,
+        tree: &mut Tree,
+    ) -> Result<(Entry, Bounds), BuildError> {
+        let mut entries = Vec::with_capacity(node5.len());
+        for (slot, content) in node5 {
+            let brick = node5_slot_brick(first_brick, usize::from(*slot));
+            let (entry, footprint) = match content {
+                Slot::Tile(value) => (Entry::constant(*value), self.footprint(brick, LOG2_NODE4_BRICKS)),
+                Slot::Child(node4) => self.flatten_node4(node4, brick, &mut tree.node4)?,
+            };
+            entries.push((usize::from(*slot), entry, footprint));
+        }
+        push_node(&mut tree.node5, NODE5_SLOTS, &entries)
+    }
+
+    fn flatten_node4(
+        &self,
+        node4: &[Leaf],
+        first_brick: IVec3,
+        nodes: &mut Nodes,
+    ) -> Result<(Entry, Bounds), BuildError> {
+        let mut entries = Vec::new();
+        for (slot, leaf) in node4.iter().enumerate() {
+            let entry = match leaf {
+                Leaf::Absent => continue,
+                Leaf::Tile(value) => Entry::constant(*value),
+                Leaf::Brick(index) => {
+                    let BrickSummary { low_bounds: [all, ..], mean } = self.summaries[*index as usize];
+                    Entry { child: *index, min: all.min, max: all.max, mean }
+                }
+            };
+            entries.push((slot, entry, self.footprint(node4_slot_brick(first_brick, slot), 0)));
+        }
+        push_node(nodes, NODE4_SLOTS, &entries)
+    }
+
+    /// Bounds over the trilinear footprint of the region of that extent: the region and the layer of voxels
+    /// beyond it.
+    fn footprint(&self, brick: IVec3, log2_bricks: u32) -> Bounds {
+        let next = |axes| brick + (step(axes) << log2_bricks);
+        let reach = |axes| self.low_bounds(next(axes), log2_bricks, axes);
+        (0..8).map(reach).reduce(Bounds::union).unwrap_or(ZERO)
+    }
+
+    /// Bounds of the voxels at the low end, along some axes, of the region of that extent around a brick.
+    fn low_bounds(&self, brick: IVec3, log2_bricks: u32, axes: usize) -> Bounds {
+        match self.root.get(&root_cell(brick).to_array()) {
+            None => ZERO,
+            Some(Slot::Tile(value)) => Bounds::of(*value),
+            Some(Slot::Child(node5)) => {
+                let slot = (log2_bricks < LOG2_NODE5_BRICKS).then(|| node5_slot(brick));
+                let leaf = (log2_bricks == 0).then(|| node4_slot(brick));
+                slot_or_face(slot, LOG2_NODE5_BRICKS - LOG2_NODE4_BRICKS, axes, 0)
+                    .map(|slot| match node5.get(&(slot as u16)) {
+                        None => ZERO,
+                        Some(Slot::Tile(value)) => Bounds::of(*value),
+                        Some(Slot::Child(node4)) => self.low_bounds_in_node4(node4, leaf, axes),
+                    })
+                    .reduce(Bounds::union)
+                    .unwrap_or(ZERO)
+            }
+        }
+    }
+
+    /// The same in one slot of a `Node4`, or in all at its low end.
+    fn low_bounds_in_node4(&self, node4: &Node4, slot: Option<usize>, axes: usize) -> Bounds {
+        slot_or_face(slot, LOG2_NODE4_BRICKS, axes, 0)
+            .map(|slot| match node4[slot] {
+                Leaf::Absent => ZERO,
+                Leaf::Tile(value) => Bounds::of(value),
+                Leaf::Brick(index) => self.summaries[index as usize].low_bounds[axes],
+            })
+            .reduce(Bounds::union)
+            .unwrap_or(ZERO)
+    }
+
+    /// The places before stored regions, along the axes of a bit set, that see values there that are not
+    /// zero: first brick, extent, axes. Those already taken by a neighbour in the same node are left out.
+    fn regions_before_others(&self) -> Vec<(IVec3, u32, usize)> {
+        let mut found = Vec::new();
+        let mut look = |brick: IVec3, log2_bricks: u32, low: &dyn Fn(usize) -> Bounds| {
+            for axes in (1..8).filter(|axes| low(*axes) != ZERO) {
+                let before = brick - (step(axes) << log2_bricks);
+                if before.min_element() >= -BRICK_END {
+                    found.push((before, log2_bricks, axes));
+                }
+            }
+        };
+        for (cell, slot) in &self.root {
+            let first_brick = IVec3::from_array(*cell) << LOG2_NODE5_BRICKS;
+            let node5 = match slot {
+                Slot::Tile(value) => {
+                    look(first_brick, LOG2_NODE5_BRICKS, &|_| Bounds::of(*value));
+                    continue;
+                }
+                Slot::Child(node5) => node5,
+            };
+            for (slot, content) in node5 {
+                let first_brick = node5_slot_brick(first_brick, usize::from(*slot));
+                let node4 = match content {
+                    Slot::Tile(value) => {
+                        look(first_brick, LOG2_NODE4_BRICKS, &|_| Bounds::of(*value));
+                        continue;
+                    }
+                    Slot::Child(node4) => node4,
+                };
+                for (slot, leaf) in node4.iter().enumerate() {
+                    let brick = node4_slot_brick(first_brick, slot);
+                    let taken = |axes: usize| {
+                        let before = brick - step(axes);
+                        before & !15 == first_brick && node4[node4_slot(before)] != Leaf::Absent
+                    };
+                    let unless_taken = |axes: usize, bounds: Bounds| if taken(axes) { ZERO } else { bounds };
+                    match leaf {
+                        Leaf::Absent => {}
+                        Leaf::Tile(value) => look(brick, 0, &|axes| unless_taken(axes, Bounds::of(*value))),
+                        Leaf::Brick(i) => {
+                            let low = self.summaries[*i as usize].low_bounds;
+                            look(brick, 0, &|axes| unless_taken(axes, low[axes]));
+                        }
+                    }
+                }
+            }
+        }
+        found
+    }
+
+    /// Stores zero wherever nothing is stored at the high end, along some axes, of the region of that extent
+    /// around a brick, in regions as large as the tree allows.
+    fn add_zero_region(&mut self, brick: IVec3, log2_bricks: u32, axes: usize) {
+        let entry = self.root.entry(root_cell(brick).to_array());
+        let Slot::Child(node5) = entry.or_insert(Slot::Tile(0.0)) else { return };
+        let slot = (log2_bricks < LOG2_NODE5_BRICKS).then(|| node5_slot(brick));
+        for slot in slot_or_face(slot, LOG2_NODE5_BRICKS - LOG2_NODE4_BRICKS, axes, 31) {
+            let Slot::Child(node4) = node5.entry(slot as u16).or_insert(Slot::Tile(0.0)) else { continue };
+            let slot = (log2_bricks == 0).then(|| node4_slot(brick));
+            for slot in slot_or_face(slot, LOG2_NODE4_BRICKS, axes, 15) {
+                if node4[slot] == Leaf::Absent {
+                    node4[slot] = Leaf::Tile(0.0);
+                }
+            }
+        }
+    }
+}
+
+/// One slot, or without one those of [`face_slots`].
+fn slot_or_face(
+    slot: Option<usize>,
+    log2_slots: u32,
+    axes: usize,
+    end: usize,
+) -> impl Iterator<Item = usize> {
+    let face = slot.is_none().then(|| face_slots(log2_slots, axes, end));
+    slot.into_iter().chain(face.into_iter().flatten())
+}
+
+/// The slots of a node whose coordinate along each of some axes is `end`.
+fn face_slots(log2_slots: u32, axes: usize, end: usize) -> impl Iterator<Item = usize> {
+    let range = move |axis: usize| if axes >> axis & 1 == 1 { end..end + 1 } else { 0..1 << log2_slots };
+    range(2).flat_map(move |x| {
+        range(1).flat_map(move |y| range(0).map(move |z| (x << log2_slots | y) << log2_slots | z))
+    })
+}
+
+/// Appends a node with these entries, sorted by slot, and gives the entry of the node itself.
+fn push_node(
+    nodes: &mut Nodes,
+    slots: usize,
+    entries: &[(usize, Entry, Bounds)],
+) -> Result<(Entry, Bounds), BuildError> {
+    if nodes.entries.len() + entries.len() >= INDEX_LIMIT {
+        return Err(BuildError::Limit { what: "tree entries", limit: INDEX_LIMIT as u64 });
+    }
+    let node = (nodes.words.len() / (slots / 32)) as u32;
+    let mut words = vec![MaskWord::default(); slots / 32];
+    for (slot, ..) in entries {
+        words[slot / 32].bits |= 1 << (slot % 32);
+    }
+    let mut first_entry = nodes.entries.len() as u32;
+    for word in &mut words {
+        word.first_entry = first_entry;
+        first_entry += word.bits.count_ones();
+    }
+    nodes.words.extend(words);
+    nodes.entries.extend(entries.iter().map(|(_, entry, _)| *entry));
+    nodes.footprints.extend(entries.iter().map(|(.., footprint)| *footprint));
+
+    // Slots without an entry are zero.
+    let start = if entries.len() < slots { Some(ZERO) } else { None };
+    let union = |all: Option<Bounds>, one: Bounds| Some(all.map_or(one, |all| all.union(one)));
+    let own = entries.iter().map(|(_, e, _)| Bounds { min: e.min, max: e.max }).fold(start, union);
+    let own = own.unwrap_or(ZERO);
+    let footprint = entries.iter().map(|(.., footprint)| *footprint).fold(start, union).unwrap_or(ZERO);
+    let sum: f64 = entries.iter().map(|(_, entry, _)| f64::from(entry.mean)).sum();
+    let mean = (sum / slots as f64) as f32;
+    Ok((Entry { child: node, min: own.min, max: own.max, mean }, footprint))
+}
