@@ -2,8 +2,8 @@
 //
 //   openvdb_read FILE REPEATS
 //
-// prints one line: median_ms=... min_ms=... grids=... active_voxels=... compression=... . Delayed loading is off, so
-// all leaf values are decoded. Opening the file is timed; freeing the grids is not.
+// prints one line: median_ms=... min_ms=... grids=... active_voxels=... compression=... (the rest of the line).
+// Delayed loading is off, so all leaf values are decoded. Opening the file is timed; freeing the grids is not.
 
 #include <openvdb/io/File.h>
 #include <openvdb/openvdb.h>
@@ -30,19 +30,18 @@ openvdb::GridPtrVecPtr readAllGrids(const std::string& path)
     return grids;
 }
 
-// What OpenVDB says of each grid's storage, joined where grids differ: "blosc+active-values,half".
+// What OpenVDB says of each grid's storage, joined where grids differ: "blosc + active values, half".
 std::string describeCompression(const openvdb::GridPtrVec& grids)
 {
     std::set<std::string> kinds;
     for (const auto& grid : grids) {
         const auto stored = grid->getMetadata<openvdb::StringMetadata>(openvdb::GridBase::META_FILE_COMPRESSION);
         std::string kind = stored ? stored->value() : "unknown";
-        kind.erase(std::remove(kind.begin(), kind.end(), ' '), kind.end());
-        if (grid->saveFloatAsHalf()) kind += ",half";
+        if (grid->saveFloatAsHalf()) kind += ", half";
         kinds.insert(kind);
     }
     std::string joined;
-    for (const auto& kind : kinds) joined += (joined.empty() ? "" : ";") + kind;
+    for (const auto& kind : kinds) joined += (joined.empty() ? "" : "; ") + kind;
     return joined;
 }
 

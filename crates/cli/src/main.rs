@@ -1,1 +1,53 @@
-fn main() {}
+//! The program `nuage`: reads the command line, hands over to one module per subcommand and turns the outcome
+//! into an exit code.
+//!
+//! A subcommand takes its arguments and returns; it never ends the process itself. What it computes lives in
+//! the libraries, what it prints in modules of its own.
+
+mod error;
+mod grid;
+mod info;
+mod json;
+mod probe;
+mod source;
+mod text;
+
+use std::process::ExitCode;
+
+use clap::error::ErrorKind;
+use clap::{CommandFactory, Parser, Subcommand};
+
+use crate::error::Failure;
+
+const AFTER_HELP: &str = "Exit codes: 0 done, 1 failed, 2 wrong usage.";
+
+/// Look into OpenVDB files and render them.
+#[derive(Parser)]
+#[command(name = "nuage", version, about, after_help = AFTER_HELP)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    Info(info::Args),
+    Probe(probe::Args),
+}
+
+fn main() -> ExitCode {
+    let outcome = match Cli::parse().command {
+        Command::Info(args) => info::run(&args),
+        Command::Probe(args) => probe::run(&args),
+    };
+    match outcome {
+        Ok(()) => ExitCode::SUCCESS,
+        // Whoever reads our output has seen enough: `nuage info x | head -1`.
+        Err(Failure::Output(error)) if error.kind() == std::io::ErrorKind::BrokenPipe => ExitCode::SUCCESS,
+        Err(Failure::Usage(message)) => Cli::command().error(ErrorKind::ValueValidation, message).exit(),
+        Err(failure) => {
+            failure.report();
+            ExitCode::FAILURE
+        }
+    }
+}

@@ -1,5 +1,6 @@
-//! The one place that knows about colour: the sRGB transfer curve, luminance, and the colour of heat. Everything else
-//! computes in scene-linear Rec.709 (the primaries and white of sRGB) and never converts by itself.
+//! The one place that knows about colour: the sRGB transfer curve, luminance, and the colour of heat.
+//! Everything else computes in scene-linear Rec.709 (the primaries and white of sRGB) and never converts by
+//! itself.
 //!
 //! There is no tone mapping here: a picture is clamped, not compressed, when it is written to eight bits.
 
@@ -12,8 +13,8 @@ pub fn luminance(rgb: [f32; 3]) -> f32 {
     0.2126 * rgb[0] + 0.7152 * rgb[1] + 0.0722 * rgb[2]
 }
 
-/// The sRGB encoding of a linear component (IEC 61966-2-1). Does not clamp: negative values continue the straight
-/// part at the foot, values above 1 the curve.
+/// The sRGB encoding of a linear component (IEC 61966-2-1). Does not clamp: negative values continue the
+/// straight part at the foot, values above 1 the curve.
 #[inline]
 pub fn linear_to_srgb(linear: f32) -> f32 {
     if linear <= 0.003_130_8 { 12.92 * linear } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 }
@@ -27,14 +28,15 @@ pub fn srgb_to_linear(encoded: f32) -> f32 {
 
 /// The nearest eight-bit sRGB code of a linear component; clamps to 0..=255. NaN gives 0.
 ///
-/// Found by comparison with the linear values halfway between codes, not by computing a power per value, so that a
-/// platform's `powf` hardly has a say in what is written to a file.
+/// Found by comparison with the linear values halfway between codes, not by computing a power per value, so
+/// that a platform's `powf` hardly has a say in what is written to a file.
 #[inline]
 pub fn linear_to_srgb8(linear: f32) -> u8 {
     static HALFWAY: LazyLock<[f32; 255]> = LazyLock::new(|| {
         std::array::from_fn(|code| {
             let encoded = (code as f64 + 0.5) / 255.0;
-            let linear = if encoded <= 0.04045 { encoded / 12.92 } else { ((encoded + 0.055) / 1.055).powf(2.4) };
+            let linear =
+                if encoded <= 0.04045 { encoded / 12.92 } else { ((encoded + 0.055) / 1.055).powf(2.4) };
             linear as f32
         })
     });
@@ -42,7 +44,8 @@ pub fn linear_to_srgb8(linear: f32) -> u8 {
     HALFWAY.partition_point(|&halfway| halfway <= linear) as u8
 }
 
-/// Spectral radiance of a black body [W / (m² sr m)] by Planck's law, with the exact constants of the SI (2019).
+/// Spectral radiance of a black body [W / (m² sr m)] by Planck's law, with the exact constants of the SI
+/// (2019).
 ///
 /// `wavelength_m` in metres, `kelvin` the temperature. 0 unless both are positive.
 pub fn planck(wavelength_m: f64, kelvin: f64) -> f64 {
@@ -58,9 +61,9 @@ pub fn planck(wavelength_m: f64, kelvin: f64) -> f64 {
 
 /// The CIE 1931 2° colour matching functions x̄, ȳ, z̄ at a wavelength in nanometres.
 ///
-/// Sums of Gaussians with a different width on either side, within about 1 % of the tables. Source: Wyman, Sloan and
-/// Shirley, "Simple Analytic Approximations to the CIE XYZ Color Matching Functions", Journal of Computer Graphics
-/// Techniques 2(2), 2013, the multi-lobe fit.
+/// Sums of Gaussians with a different width on either side, within about 1 % of the tables. Source: Wyman,
+/// Sloan and Shirley, "Simple Analytic Approximations to the CIE XYZ Color Matching Functions", Journal of
+/// Computer Graphics Techniques 2(2), 2013, the multi-lobe fit.
 fn matching_functions(nanometres: f64) -> [f64; 3] {
     let lobe = |height: f64, peak: f64, left: f64, right: f64| {
         let t = (nanometres - peak) / if nanometres < peak { left } else { right };
@@ -73,8 +76,8 @@ fn matching_functions(nanometres: f64) -> [f64; 3] {
     ]
 }
 
-/// CIE XYZ of a black body, up to a common factor: 5 nm steps over the visible range, where the integrand is smooth
-/// and vanishes at both ends.
+/// CIE XYZ of a black body, up to a common factor: 5 nm steps over the visible range, where the integrand is
+/// smooth and vanishes at both ends.
 fn blackbody_xyz(kelvin: f64) -> [f64; 3] {
     let mut xyz = [0.0; 3];
     for step in 0..=94 {
@@ -96,26 +99,26 @@ fn rgb_from_xyz([x, y, z]: [f64; 3]) -> [f64; 3] {
     ]
 }
 
-/// The colour and brightness of glowing matter over temperature, relative to a reference temperature whose luminance
-/// is 1. A table, so that one look-up per sample along a ray is cheap.
+/// The colour and brightness of glowing matter over temperature, relative to a reference temperature whose
+/// luminance is 1. A table, so that one look-up per sample along a ray is cheap.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Blackbody {
-    /// Colour of luminance 1, and the natural logarithm of the relative luminance, at equal steps of the reciprocal
-    /// temperature from hot to cold. Over the reciprocal the logarithm is nearly straight (Wien's law), so that a
-    /// linear interpolation of it is within 0.1 %.
+    /// Colour of luminance 1, and the natural logarithm of the relative luminance, at equal steps of the
+    /// reciprocal temperature from hot to cold. Over the reciprocal the logarithm is nearly straight (Wien's
+    /// law), so that a linear interpolation of it is within 0.1 %.
     table: Vec<[f32; 4]>,
 }
 
 impl Blackbody {
-    /// At and below this temperature [K] nothing glows: [`radiance`](Self::radiance) is 0.
+    /// At and below this temperature, in kelvin, nothing glows: [`radiance`](Self::radiance) is 0.
     pub const COLDEST_KELVIN: f32 = 500.0;
-    /// Above this temperature [K] the radiance stays what it is here.
+    /// Above this temperature, in kelvin, the radiance stays what it is here.
     pub const HOTTEST_KELVIN: f32 = 50_000.0;
     const STEPS: usize = 1024;
 
     /// The table in which `reference_kelvin` has luminance 1. A reference outside of
-    /// [`COLDEST_KELVIN`](Self::COLDEST_KELVIN)..=[`HOTTEST_KELVIN`](Self::HOTTEST_KELVIN) counts as the nearer end,
-    /// NaN as the hot one.
+    /// [`COLDEST_KELVIN`](Self::COLDEST_KELVIN)..=[`HOTTEST_KELVIN`](Self::HOTTEST_KELVIN) counts as the
+    /// nearer end, NaN as the hot one.
     pub fn new(reference_kelvin: f32) -> Self {
         let reference = if reference_kelvin.is_nan() { Self::HOTTEST_KELVIN } else { reference_kelvin };
         let reference = reference.clamp(Self::COLDEST_KELVIN, Self::HOTTEST_KELVIN);
@@ -132,12 +135,13 @@ impl Blackbody {
         Self { table: (0..=Self::STEPS).map(entry).collect() }
     }
 
-    /// Radiance at a temperature as linear Rec.709, relative to the reference: Planck's law seen through the CIE 1931
-    /// observer.
+    /// Radiance at a temperature as linear Rec.709, relative to the reference: Planck's law seen through the
+    /// CIE 1931 observer.
     ///
-    /// Below about 1900 K the true colour lies outside of Rec.709. Its negative components are set to 0 and the rest
-    /// scaled so that the luminance is kept. Luminance rises with temperature throughout. 0 at and below
-    /// [`COLDEST_KELVIN`](Self::COLDEST_KELVIN) and for NaN; constant above [`HOTTEST_KELVIN`](Self::HOTTEST_KELVIN).
+    /// Below about 1900 K the true colour lies outside of Rec.709. Its negative components are set to 0 and
+    /// the rest scaled so that the luminance is kept. Luminance rises with temperature throughout. 0 at and
+    /// below [`COLDEST_KELVIN`](Self::COLDEST_KELVIN) and for NaN; constant above
+    /// [`HOTTEST_KELVIN`](Self::HOTTEST_KELVIN).
     #[inline]
     pub fn radiance(&self, kelvin: f32) -> [f32; 3] {
         const HOT: f32 = 1.0 / Blackbody::HOTTEST_KELVIN;
@@ -148,7 +152,8 @@ impl Blackbody {
         let position = (1.0 / kelvin - HOT).max(0.0) * (Self::STEPS as f32 / (COLD - HOT));
         let index = (position as usize).min(Self::STEPS - 1);
         let t = position - index as f32;
-        let Some([a, b]) = self.table.get(index..index + 2).and_then(|pair| <&[_; 2]>::try_from(pair).ok()) else {
+        let Some([a, b]) = self.table.get(index..index + 2).and_then(|pair| <&[_; 2]>::try_from(pair).ok())
+        else {
             return [0.0; 3];
         };
         let lerp = |i: usize| a[i] + (b[i] - a[i]) * t;
@@ -229,7 +234,10 @@ mod tests {
                 0.019_330_8 * r + 0.119_194_8 * g + 0.950_532_2 * b,
             ];
             let sum: f64 = back.iter().sum();
-            assert!((back[0] / sum - x).abs() < 0.01 && (back[1] / sum - y).abs() < 0.01, "{kelvin} K: {back:?}");
+            assert!(
+                (back[0] / sum - x).abs() < 0.01 && (back[1] / sum - y).abs() < 0.01,
+                "{kelvin} K: {back:?}"
+            );
         }
     }
 
@@ -256,7 +264,9 @@ mod tests {
             (0..1600).map(|i| planck(at(i) * 1e-9, kelvin) * matching_functions(at(i))[1]).sum()
         };
         let table = Blackbody::new(1500.0);
-        for (a, b) in [(800.0f32, 1000.0f32), (1000.0, 1500.0), (1234.5, 3210.0), (2000.0, 8000.0), (9e3, 3e4)] {
+        for (a, b) in
+            [(800.0f32, 1000.0f32), (1000.0, 1500.0), (1234.5, 3210.0), (2000.0, 8000.0), (9e3, 3e4)]
+        {
             let got = f64::from(luminance(table.radiance(b)) / luminance(table.radiance(a)));
             let expected = direct(f64::from(b)) / direct(f64::from(a));
             assert!((got / expected - 1.0).abs() < 2e-3, "{a} K to {b} K: {got} instead of {expected}");

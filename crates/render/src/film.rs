@@ -1,13 +1,15 @@
-//! The picture in memory: scene-linear Rec.709 with premultiplied alpha, and what is done to whole pictures. Nothing
-//! here knows how a picture is rendered, encoded ([`output`](crate::output)) or converted to a display's colours
-//! ([`color`](crate::color)).
+//! The picture in memory: scene-linear Rec.709 with premultiplied alpha, and what is done to whole pictures.
+//! Nothing here knows how a picture is rendered, encoded ([`output`](crate::output)) or converted to a
+//! display's colours ([`color`](crate::color)).
 
 /// The most pixels that one [`Image`] may have: 8192 x 8192, one gibibyte.
 pub const MAX_PIXELS: u64 = 1 << 26;
 
 /// A picture size that is empty, or beyond what this renderer holds in memory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("a picture of {width} x {height} pixels is not possible: both sides must be at least 1, and the area at most {MAX_PIXELS} pixels")]
+#[error(
+    "a picture of {width} x {height} pixels is not possible: both sides must be at least 1, and the area at most {MAX_PIXELS} pixels"
+)]
 pub struct ImageSizeError {
     /// Columns asked for.
     pub width: u32,
@@ -57,8 +59,8 @@ impl Image {
         self.map(|[r, g, b, alpha]| [r * gain, g * gain, b * gain, alpha])
     }
 
-    /// Copies `source` into this picture, its top left corner at column `left` and row `top`. What falls outside is
-    /// left out. Replaces, does not blend.
+    /// Copies `source` into this picture, its top left corner at column `left` and row `top`. What falls
+    /// outside is left out. Replaces, does not blend.
     pub fn blit(&mut self, source: &Self, left: u32, top: u32) {
         let columns = source.width.min(self.width.saturating_sub(left)) as usize;
         if columns == 0 {
@@ -96,7 +98,9 @@ mod tests {
 
     #[test]
     fn impossible_sizes_are_refused() {
-        for (width, height) in [(0, 5), (5, 0), (0, 0), (u32::MAX, u32::MAX), (1 << 16, 1 << 16), (1 << 26, 2)] {
+        for (width, height) in
+            [(0, 5), (5, 0), (0, 0), (u32::MAX, u32::MAX), (1 << 16, 1 << 16), (1 << 26, 2)]
+        {
             assert_eq!(Image::new(width, height), Err(ImageSizeError { width, height }));
         }
         assert_eq!(pixel_count(8192, 8192), Ok(1 << 26));
@@ -105,7 +109,11 @@ mod tests {
 
     #[test]
     fn over_shows_the_background_through_what_is_missing() {
-        let image = Image { width: 3, height: 1, pixels: vec![[0.0; 4], [0.25, 0.5, 0.0, 0.5], [2.0, 0.0, 0.0, 1.0]] };
+        let image = Image {
+            width: 3,
+            height: 1,
+            pixels: vec![[0.0; 4], [0.25, 0.5, 0.0, 0.5], [2.0, 0.0, 0.0, 1.0]],
+        };
         let over = image.over([1.0, 0.5, 0.25]);
         let expected = [[1.0, 0.5, 0.25, 1.0], [0.75, 0.75, 0.125, 1.0], [2.0, 0.0, 0.0, 1.0]];
         assert_eq!(over.pixels, expected);

@@ -1,13 +1,15 @@
-//! Random numbers without state: every number is a hash of where it is used (pixel, sample, dimension). A picture is
-//! therefore the same for any number of threads and any order of pixels, and a shader can draw the same numbers.
+//! Random numbers without state: every number is a hash of where it is used (pixel, sample, dimension). A
+//! picture is therefore the same for any number of threads and any order of pixels, and a shader can draw the
+//! same numbers.
 //!
 //! What is done with the numbers (directions, distances) lives with the thing that is sampled, such as
 //! [`phase`](crate::phase).
 
-/// A bijection of 32 bits that flips each output bit with a chance close to one half when any input bit flips.
+/// A bijection of 32 bits that flips each output bit with a chance close to one half when any input bit
+/// flips.
 ///
-/// Two rounds of xor-shift and multiplication, with the constants that TheIronBorn found by search (bias 0.107) with
-/// Wellons' hash-prospector (<https://github.com/skeeto/hash-prospector>). 0 maps to 0.
+/// Two rounds of xor-shift and multiplication, with the constants that TheIronBorn found by search (bias
+/// 0.107) with Wellons' hash-prospector (<https://github.com/skeeto/hash-prospector>). 0 maps to 0.
 #[inline]
 pub fn hash_u32(x: u32) -> u32 {
     let x = (x ^ (x >> 16)).wrapping_mul(0x21f0_aaad);
@@ -15,10 +17,11 @@ pub fn hash_u32(x: u32) -> u32 {
     x ^ (x >> 15)
 }
 
-/// 32 random bits for one `dimension` (the count of numbers drawn so far) of one `sample` of the pixel at `x`, `y`.
+/// 32 random bits for one `dimension` (the count of numbers drawn so far) of one `sample` of the pixel at
+/// `x`, `y`.
 ///
-/// Pixels of an image of up to 65536 x 65536 start from different values. The dimension enters last, so that a loop
-/// over dimensions, or over samples, repeats only the rounds that change.
+/// Pixels of an image of up to 65536 x 65536 start from different values. The dimension enters last, so that
+/// a loop over dimensions, or over samples, repeats only the rounds that change.
 #[inline]
 pub fn hash_pixel(x: u32, y: u32, sample: u32, dimension: u32) -> u32 {
     // The golden ratio's bits keep the corner pixel's first number away from the hash's fixed point at 0.
@@ -27,7 +30,8 @@ pub fn hash_pixel(x: u32, y: u32, sample: u32, dimension: u32) -> u32 {
     hash_u32(path.wrapping_add(dimension))
 }
 
-/// The upper 24 of the `bits` as a number in [0, 1), evenly spaced by 2^-24: every step a float can take near 1.
+/// The upper 24 of the `bits` as a number in [0, 1), evenly spaced by 2^-24: every step a float can take near
+/// 1.
 #[inline]
 pub fn unit_f32(bits: u32) -> f32 {
     (bits >> 8) as f32 * (1.0 / 16_777_216.0)
@@ -37,7 +41,8 @@ pub fn unit_f32(bits: u32) -> f32 {
 mod tests {
     use super::*;
 
-    /// How many standard deviations the chi-square statistic of `counts`, expected equal, lies above its mean.
+    /// How many standard deviations the chi-square statistic of `counts`, expected equal, lies above its
+    /// mean.
     fn chi_square_excess(counts: &[u32]) -> f64 {
         let expected = counts.iter().map(|&c| f64::from(c)).sum::<f64>() / counts.len() as f64;
         let chi_square: f64 = counts.iter().map(|&c| (f64::from(c) - expected).powi(2) / expected).sum();

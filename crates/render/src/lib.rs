@@ -1,1 +1,25 @@
-//! Placeholder.
+//! The CPU renderer: the reference that every other renderer of the project is held to.
+//!
+//! [`scene`] says what is rendered and [`camera`] from where; [`traverse`] walks rays through the packed tree;
+//! [`march`] integrates light along them; [`picture`] runs that over all pixels; [`framing`] finds views and
+//! densities for volumes that nobody described; [`film`] and [`output`] hold and encode pictures. Physics in
+//! small functions: [`phase`], [`color`], [`math`], [`hash`].
+//!
+//! Light is scene-linear Rec.709 in f32 throughout. Distances are world lengths, steps are voxels.
+//!
+//! What does not live here: files, sequences, the import of grids and the program.
+
+#![forbid(unsafe_code)]
+
+pub mod camera;
+pub mod color;
+pub mod film;
+pub mod framing;
+pub mod hash;
+pub mod march;
+pub mod math;
+pub mod output;
+pub mod phase;
+pub mod picture;
+pub mod scene;
+pub mod traverse;

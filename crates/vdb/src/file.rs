@@ -166,7 +166,7 @@ impl<S: Source> File<S> {
                     let info = read_grid_header(cursor, &descriptor, &mut budget)?;
                     Ok((info, cursor.offset() - grid_begin))
                 })?;
-                budget.take(1, 512 + used as usize * 3, "the headers of all grids")?;
+                take_grid_header(&mut budget, after - at + used)?;
                 if info.tree_range[0] > grid_end {
                     return Err(Error::malformed(info.tree_range[0], "a grid's header passes its end"));
                 }
@@ -296,17 +296,29 @@ fn read_grid_header(
     })
 }
 
+/// Counts what is kept of a grid's header. A byte of it becomes up to six: names are held twice and each byte
+/// that is not UTF-8 becomes three, and the smallest metadata entry has twelve bytes.
+fn take_grid_header(budget: &mut Budget, header_bytes: u64) -> Result<()> {
+    let kept_bytes = usize::try_from(header_bytes).unwrap_or(usize::MAX).saturating_mul(6);
+    // Twice for the growth of the vector of grids.
+    let info_bytes = 2 * size_of::<GridInfo>();
+    budget.take(1, kept_bytes.saturating_add(info_bytes), "the headers of all grids")
+}
+
 /// Finds the grids of a file without positions by walking through all of them.
 fn walk_stream(source: &impl Source, header: &Header, size: u64, limits: &Limits) -> Result<Vec<GridInfo>> {
     let mut budget = Budget::new(limits);
-    let len = usize::try_from(size - header.end).unwrap_or(usize::MAX);
+    // The source may have grown since it was asked for its size.
+    let len = usize::try_from(size.saturating_sub(header.end)).unwrap_or(usize::MAX);
     budget.take(len, 1, "a file without grid positions")?;
     let bytes = source.range(header.end, len)?;
     let mut cursor = Cursor::new(&bytes, header.end);
     let mut grids = Vec::new();
     for _ in 0..header.grid_count {
+        let begin = cursor.offset();
         let descriptor = read_descriptor(&mut cursor)?;
         let mut info = read_grid_header(&mut cursor, &descriptor, &mut budget)?;
+        take_grid_header(&mut budget, cursor.offset() - begin)?;
         if info.instance_of.is_none() {
             let layout = info.layout().ok_or_else(|| {
                 Error::unsupported(format!(

@@ -67,7 +67,9 @@ impl Metadata {
             let type_name = cursor.string("a metadata type name")?;
             let len = cursor.u32("the size of a metadata value")?;
             let bytes = cursor.take(len as usize, "a metadata value")?;
-            budget.take(1, 96 + 2 * (name.len() + type_name.len()) + bytes.len(), "metadata")?;
+            // The entry itself counts twice for the growth of the vector and once more for the sorting.
+            let entry_bytes = 3 * size_of::<(String, MetaValue)>();
+            budget.take(1, entry_bytes + 2 * (name.len() + type_name.len()) + bytes.len(), "metadata")?;
             // Where OpenVDB keeps positions for its own delayed loading; of no use to anyone else.
             if name != "file_delayed_load" {
                 entries.push((name, MetaValue { type_name, bytes: bytes.to_vec() }));
@@ -76,6 +78,7 @@ impl Metadata {
         entries.reverse();
         entries.sort_by(|a, b| a.0.cmp(&b.0));
         entries.dedup_by(|a, b| a.0 == b.0);
+        entries.shrink_to_fit();
         Ok(Metadata { entries })
     }
 }

@@ -80,11 +80,18 @@ pub(crate) fn parse_window<T>(
         let window = source.range(offset, len as usize)?;
         let mut cursor = Cursor::new(&window, offset);
         match parse(&mut cursor) {
-            Err(_) if cursor.ran_out && len < left => len = left.min(len.saturating_mul(8).max(4096)),
+            Err(_) if cursor.ran_out && len < left => {
+                let larger = left.min(len.saturating_mul(8).max(4096));
+                // The last window that the limit allows is tried before it is refused.
+                len = if len < max_window_bytes { larger.min(max_window_bytes) } else { larger };
+            }
             result => return result,
         }
     }
 }
+
+/// Longer than any name or type that makes sense, and short enough to be decoded before it is counted.
+const MAX_NAME_BYTES: usize = 1 << 20;
 
 /// A checked reader of little-endian values over a slice that starts at a known offset of the file.
 #[derive(Debug, Clone)]
@@ -104,7 +111,6 @@ impl<'a> Cursor<'a> {
     pub(crate) fn offset(&self) -> u64 {
         self.offset
     }
-
 
     pub(crate) fn malformed(&self, what: impl Into<String>) -> Error {
         Error::malformed(self.offset, what)
@@ -160,8 +166,11 @@ impl<'a> Cursor<'a> {
 
     /// A string: its length as u32, then its bytes. Bytes that are not UTF-8 are replaced.
     pub(crate) fn string(&mut self, what: &str) -> Result<String> {
-        let len = self.u32(what)?;
-        Ok(String::from_utf8_lossy(self.take(len as usize, what)?).into_owned())
+        let len = self.u32(what)? as usize;
+        if len > MAX_NAME_BYTES {
+            return Err(self.malformed(format!("{what} of {len} bytes")));
+        }
+        Ok(String::from_utf8_lossy(self.take(len, what)?).into_owned())
     }
 
     /// A bit mask of `words.len() * 64` bits.

@@ -8,8 +8,8 @@ use serde_json::Value;
 fn every_float_grid_equals_the_truth() {
     let (mut files, mut grids) = (0, 0);
     for (path, truth) in testkit::truths() {
-        let file = File::open(std::fs::read(&path).unwrap())
-            .unwrap_or_else(|e| panic!("{}: {e}", path.display()));
+        let file =
+            File::open(std::fs::read(&path).unwrap()).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
         assert_eq!(u64::from(file.file_version), truth["file_version"].as_u64().unwrap());
         let [major, minor] = file.library_version;
         assert_eq!(format!("{major}.{minor}"), truth["library_version"].as_str().unwrap());
@@ -29,7 +29,10 @@ fn every_float_grid_equals_the_truth() {
                 grids += 1;
             } else {
                 let refused = file.read_grid(index).map(|_| ());
-                assert!(matches!(refused, Err(nuage_vdb::Error::Unsupported { .. })), "{context}: {refused:?}");
+                assert!(
+                    matches!(refused, Err(nuage_vdb::Error::Unsupported { .. })),
+                    "{context}: {refused:?}"
+                );
             }
         }
     }

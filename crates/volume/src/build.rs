@@ -83,14 +83,26 @@ impl TreeBuilder {
         Self::default()
     }
 
-    /// Adds a brick at a brick coordinate. The n-th brick added is the n-th of the array given to
-    /// [`TreeBuilder::finish`].
+    /// Adds a brick at a brick coordinate and gives its index. The n-th brick added is the n-th of the array
+    /// given to [`TreeBuilder::finish`].
     ///
     /// # Errors
     /// If something is there already.
-    pub fn brick(&mut self, brick: IVec3, summary: BrickSummary) -> Result<(), BuildError> {
+    pub fn brick(&mut self, brick: IVec3, summary: BrickSummary) -> Result<u32, BuildError> {
         let index = self.summaries.len() as u32;
         self.summaries.push(summary);
+        self.leaf(brick, Leaf::Brick(index)).map(|()| index)
+    }
+
+    /// Places a brick that was added before at another brick coordinate as well.
+    ///
+    /// # Errors
+    /// If something is there already.
+    ///
+    /// # Panics
+    /// If no brick of that index was added.
+    pub fn brick_again(&mut self, brick: IVec3, index: u32) -> Result<(), BuildError> {
+        assert!((index as usize) < self.summaries.len(), "brick {index} was added before");
         self.leaf(brick, Leaf::Brick(index))
     }
 

@@ -1,7 +1,8 @@
-//! OpenEXR: the picture as it was computed, scene-linear and premultiplied, for compositing and for measuring.
+//! OpenEXR: the picture as it was computed, scene-linear and premultiplied, for compositing and for
+//! measuring.
 //!
-//! One part, ZIP-compressed scan lines, channels R, G, B, A. No chromaticities are written: without them a reader
-//! assumes Rec.709, which is what ours are.
+//! One part, ZIP-compressed scan lines, channels R, G, B, A. No chromaticities are written: without them a
+//! reader assumes Rec.709, which is what ours are.
 
 use super::{OutputError, check};
 use crate::film::Image;
@@ -38,7 +39,8 @@ fn encode<S: IntoSample>(image: &Image, sample: impl Fn(f32) -> S + Sync) -> Res
         let [r, g, b, a] = image.pixels.get(at.y() * size.x() + at.x()).copied().unwrap_or_default();
         (sample(r), sample(g), sample(b), sample(a))
     });
-    let layer = exr::prelude::Layer::new(size, LayerAttributes::default(), Encoding::SMALL_LOSSLESS, channels);
+    let layer =
+        exr::prelude::Layer::new(size, LayerAttributes::default(), Encoding::SMALL_LOSSLESS, channels);
     let picture = exr::prelude::Image::from_layer(layer);
     let writer = picture.write();
     let writer = if cfg!(feature = "parallel") { writer } else { writer.non_parallel() };
@@ -66,7 +68,11 @@ mod tests {
             .no_deep_data()
             .largest_resolution_level()
             .rgba_channels(
-                |size, _| Image { width: size.x() as u32, height: size.y() as u32, pixels: vec![[0.0; 4]; size.area()] },
+                |size, _| Image {
+                    width: size.x() as u32,
+                    height: size.y() as u32,
+                    pixels: vec![[0.0; 4]; size.area()],
+                },
                 |image, at, (r, g, b, a): (f32, f32, f32, f32)| {
                     image.pixels[at.y() * image.width as usize + at.x()] = [r, g, b, a];
                 },
@@ -102,7 +108,7 @@ mod tests {
         assert_eq!(back.pixels[7], [65_504.0, -65_504.0, 65_504.0, 65_504.0]);
         for (value, got) in image.pixels.iter().flatten().zip(back.pixels.iter().flatten()) {
             if value.abs() < 65_504.0 {
-                assert_eq!(half::f16::from_f32(*value).to_f32(), *got);
+                assert_eq!(f16::from_f32(*value).to_f32(), *got);
                 assert!((value - got).abs() <= value.abs() / 2048.0 + 3e-8);
             }
         }

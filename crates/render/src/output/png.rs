@@ -1,7 +1,8 @@
-//! PNG and animated PNG: eight bits, sRGB, alpha not premultiplied (PNG knows no other), for screens and web pages.
+//! PNG and animated PNG: eight bits, sRGB, alpha not premultiplied (PNG knows no other), for screens and web
+//! pages.
 //!
-//! Light is clamped to what the format can show, never tone mapped. Light without coverage (a flame in front of
-//! nothing) can't be expressed with such alpha: put the picture over a background first
+//! Light is clamped to what the format can show, never tone mapped. Light without coverage (a flame in front
+//! of nothing) can't be expressed with such alpha: put the picture over a background first
 //! ([`Image::over`](crate::film::Image::over)).
 
 use super::{OutputError, check};
@@ -19,11 +20,11 @@ pub fn encode_png(image: &Image) -> Result<Vec<u8>, OutputError> {
     Ok(file)
 }
 
-/// Pictures of one size as an animated PNG that loops forever: RGBA, or RGB if all are opaque everywhere. Each frame
-/// after the first stores only the rectangle in which it differs from the one before.
+/// Pictures of one size as an animated PNG that loops forever: RGBA, or RGB if all are opaque everywhere.
+/// Each frame after the first stores only the rectangle in which it differs from the one before.
 ///
-/// `frames_per_second` is kept to better than 0.1 % between 0.001 and 65535, rates such as 24000/1001 included. Fails
-/// without frames, on frames of different sizes, and on other rates.
+/// `frames_per_second` is kept to better than 0.1 % between 0.001 and 65535, rates such as 24000/1001
+/// included. Fails without frames, on frames of different sizes, and on other rates.
 pub fn encode_apng(frames: &[Image], frames_per_second: f64) -> Result<Vec<u8>, OutputError> {
     let (delay_numerator, delay_denominator) = frame_delay(frames_per_second)?;
     let [first, ..] = frames else {
@@ -108,8 +109,8 @@ struct Rectangle {
     bytes: Vec<u8>,
 }
 
-/// The smallest rectangle of `now` that holds every difference from `before`; one pixel if they are equal, because a
-/// frame can't be empty.
+/// The smallest rectangle of `now` that holds every difference from `before`; one pixel if they are equal,
+/// because a frame can't be empty.
 fn changed_rectangle(before: &[u8], now: &[u8], row_bytes: usize, pixel_bytes: usize) -> Rectangle {
     let (mut left, mut right, mut top, mut bottom) = (usize::MAX, 0, usize::MAX, 0);
     for (y, (old, new)) in before.chunks_exact(row_bytes).zip(now.chunks_exact(row_bytes)).enumerate() {
@@ -124,7 +125,8 @@ fn changed_rectangle(before: &[u8], now: &[u8], row_bytes: usize, pixel_bytes: u
     if top == usize::MAX {
         (left, top) = (0, 0);
     }
-    let row_part = |row: &'_ [u8]| row.get(left * pixel_bytes..(right + 1) * pixel_bytes).unwrap_or(&[]).to_vec();
+    let row_part =
+        |row: &'_ [u8]| row.get(left * pixel_bytes..(right + 1) * pixel_bytes).unwrap_or(&[]).to_vec();
     let rows = now.chunks_exact(row_bytes).skip(top).take(bottom - top + 1);
     // All of these are within the picture, whose sides are u32.
     Rectangle {
@@ -139,7 +141,9 @@ fn changed_rectangle(before: &[u8], now: &[u8], row_bytes: usize, pixel_bytes: u
 /// The time of one frame as the fraction of 16-bit numbers that comes closest, the smallest if several do.
 fn frame_delay(frames_per_second: f64) -> Result<(u16, u16), OutputError> {
     if !(0.001..=65535.0).contains(&frames_per_second) {
-        return Err(OutputError::Misuse(format!("{frames_per_second} frames per second: must be 0.001 to 65535")));
+        return Err(OutputError::Misuse(format!(
+            "{frames_per_second} frames per second: must be 0.001 to 65535"
+        )));
     }
     let mut best = (1, 1, f64::INFINITY);
     for numerator in 1..=u16::MAX {
@@ -204,7 +208,8 @@ mod tests {
 
     #[test]
     fn wild_values_are_clamped() {
-        let pixels = vec![[f32::NAN, f32::INFINITY, -1.0, 1.0], [1.0, 1.0, 1.0, f32::NAN], [2.0, 0.5, 9.0, 7.0]];
+        let pixels =
+            vec![[f32::NAN, f32::INFINITY, -1.0, 1.0], [1.0, 1.0, 1.0, f32::NAN], [2.0, 0.5, 9.0, 7.0]];
         let (_, bytes) = decode(&encode_png(&Image { width: 3, height: 1, pixels }).unwrap());
         assert_eq!(bytes, [0, 255, 0, 255, 0, 0, 0, 0, 255, 188, 255, 255]);
     }

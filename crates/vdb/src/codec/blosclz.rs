@@ -3,13 +3,15 @@
 //! A stream is a row of instructions, each led by a control byte `c`:
 //!
 //! - `c < 32`: the `c + 1` bytes that follow are copied out.
-//! - `c >= 32`: bytes already written are repeated. The length is `(c >> 5) + 2`; if `c >> 5` is 7, bytes that
-//!   follow are added to it, up to and including the first below 255. The next byte `low` gives the distance
-//!   `256 · (c & 31) + low + 1`. If that has its largest value, two more bytes, the high one first, are added
-//!   to it.
+//! - `c >= 32`: bytes already written are repeated. The length is `(c >> 5) + 2`; if `c >> 5` is 7, bytes
+//!   that follow are added to it, up to and including the first below 255. The next byte `low` gives the
+//!   distance `256 · (c & 31) + low + 1`. If that has its largest value, two more bytes, the high one
+//!   first, are added to it.
 //!
-//! The first control byte is always a copy: only its low five bits count. The end of the input ends the stream;
-//! neither the size of the output nor a checksum is stored.
+//! The first control byte is always a copy: only its low five bits count. The end of the input ends the
+//! stream; neither the size of the output nor a checksum is stored.
+//!
+//! Source: the format as `blosclz.c` of <https://github.com/Blosc/c-blosc> defines it.
 
 /// Decodes `input` into `out`. `None` unless it is sound and gives exactly `out.len()` bytes.
 pub(super) fn decompress(input: &[u8], out: &mut [u8]) -> Option<()> {
@@ -61,8 +63,8 @@ fn match_distance(control: u8, input: &mut Bytes) -> Option<usize> {
     Some(NEAR_MAX + usize::from(far))
 }
 
-/// Fills `out[from..]` with what stands `distance` bytes earlier, which may overlap with what is being filled.
-/// `None` if that would be before the start.
+/// Fills `out[from..]` with what stands `distance` bytes earlier, which may overlap with what is being
+/// filled. `None` if that would be before the start.
 fn repeat(out: &mut [u8], from: usize, distance: usize) -> Option<()> {
     let source = from.checked_sub(distance)?;
     if distance == 1 {
@@ -163,7 +165,9 @@ mod tests {
 
     proptest! {
         #[test]
-        fn any_bytes_decode_or_fail(input in proptest::collection::vec(any::<u8>(), 0..200), size in 0_usize..500) {
+        fn any_bytes_decode_or_fail(
+            input in proptest::collection::vec(any::<u8>(), 0..200), size in 0_usize..500,
+        ) {
             if let Some(out) = decoded(&input, size) {
                 prop_assert_eq!(out.len(), size);
                 // A stream has one size only.

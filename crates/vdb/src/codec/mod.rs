@@ -2,7 +2,7 @@
 //!
 //! A `.vdb` file compresses the values of each leaf and inner node on their own, with zlib or as a Blosc
 //! chunk. The functions here turn one such block back into exactly the bytes that the caller expects, and
-//! take no more memory than that (plus a constant), whatever the block claims about itself.
+//! take no more memory than a few times that (plus a constant), whatever the block claims about itself.
 //!
 //! What the bytes mean, which codec a grid uses and where a block starts and ends is none of their business:
 //! the readers of files and grids know that.

@@ -1,8 +1,8 @@
 //! Undoes Blosc's two filters, which regroup a block before it is compressed.
 //!
-//! The byte shuffle stores byte 0 of all elements, then byte 1 of all elements, and so on. The bit shuffle does
-//! the same with bits: bit 0 of byte 0 of all elements, packed eight to a byte with the first element in the
-//! lowest bit, then bit 1, … Bytes beyond the last whole element stay where they are.
+//! The byte shuffle stores byte 0 of all elements, then byte 1 of all elements, and so on. The bit shuffle
+//! does the same with bits: bit 0 of byte 0 of all elements, packed eight to a byte with the first element
+//! in the lowest bit, then bit 1, … Bytes beyond the last whole element stay where they are.
 
 /// Undoes the byte shuffle of elements of `typesize` bytes (at least 1). Both slices have the same length.
 pub(super) fn unshuffle_bytes(typesize: usize, src: &[u8], out: &mut [u8]) {
@@ -33,8 +33,8 @@ fn unshuffle_2(planes: &[u8], elements: &mut [u8]) {
     }
 }
 
-/// Pairs the bytes of two planes in a strip, then pairs those pairs: the compiler turns each of these loops into
-/// vector instructions, but not one loop over all four planes.
+/// Pairs the bytes of two planes in a strip, then pairs those pairs: the compiler makes better vector code of
+/// these loops than of one loop over all four planes.
 fn unshuffle_4(planes: &[u8], elements: &mut [u8]) {
     const STRIP: usize = 64;
     let (p01, p23) = planes.split_at(planes.len() / 2);
@@ -58,11 +58,11 @@ fn unshuffle_4(planes: &[u8], elements: &mut [u8]) {
 
 /// Undoes the bit shuffle of elements of `typesize` bytes (at least 1). Both slices have the same length.
 ///
-/// Blosc 1 shuffles bits only where the number of whole elements is a multiple of 8; other blocks it leaves as
-/// they are, and so does this.
+/// Blosc 1 shuffles bits only where the number of whole elements is a multiple of 8; other blocks it leaves
+/// as they are, and so does this.
 pub(super) fn unshuffle_bits(typesize: usize, src: &[u8], out: &mut [u8]) {
     let count = src.len() / typesize;
-    if count == 0 || count % 8 != 0 {
+    if count == 0 || !count.is_multiple_of(8) {
         out.copy_from_slice(src);
         return;
     }
@@ -83,8 +83,8 @@ pub(super) fn unshuffle_bits(typesize: usize, src: &[u8], out: &mut [u8]) {
 /// Bit `c` of byte `r` becomes bit `r` of byte `c`.
 fn transpose_8x8(rows: [u8; 8]) -> [u8; 8] {
     let mut bits = u64::from_le_bytes(rows);
-    // Swap across the diagonal in 2×2 squares of single bits, then of 2×2, then of 4×4 bits. The mask holds the
-    // bits that move up by `shift`.
+    // Swap across the diagonal in 2×2 squares of single bits, then of 2×2, then of 4×4 bits. The mask holds
+    // the bits that move up by `shift`.
     for (shift, mask) in
         [(7, 0x00aa_00aa_00aa_00aa), (14, 0x0000_cccc_0000_cccc), (28, 0x0000_0000_f0f0_f0f0)]
     {
@@ -116,7 +116,7 @@ mod tests {
     fn shuffle_bits(typesize: usize, src: &[u8]) -> Vec<u8> {
         let count = src.len() / typesize;
         let mut out = src.to_vec();
-        if count % 8 != 0 {
+        if !count.is_multiple_of(8) {
             return out;
         }
         out[..count * typesize].fill(0);

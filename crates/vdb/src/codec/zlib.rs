@@ -60,7 +60,7 @@ mod tests {
 
     #[test]
     fn other_sizes_and_cut_streams_are_malformed() {
-        let data: Vec<u8> = (0..2048_u32).map(|i| (i * i >> 9) as u8).collect();
+        let data: Vec<u8> = (0..2048_u32).map(|i| ((i * i) >> 9) as u8).collect();
         let stream = compress(&data, 6);
         let mut scratch = Scratch::default();
         for size in [0, 1, 2047, 2049, 5000] {

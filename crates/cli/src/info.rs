@@ -1,0 +1,164 @@
+//! `nuage info`: what is in VDB files, grid by grid.
+//!
+//! This module goes through files and grids and keeps going past what is damaged; [`text`] and [`json`] say
+//! how the findings look. Grids are read one after another, so memory holds one at a time.
+
+use std::io::{self, BufWriter, Write};
+use std::path::{Path, PathBuf};
+
+use nuage_vdb::{File, InternalNode, Source, Statistics, Tiles, Tree};
+use serde_json::Value;
+
+use crate::error::{Failure, explain};
+use crate::source::DiskFile;
+use crate::{json, text};
+
+/// List the grids of VDB files: type, size, values, transform, metadata.
+///
+/// Values of float grids are read and summed up; of other grids the header alone is shown. Boxes include both
+/// ends. Matrices apply to row vectors, so the last row is the translation.
+#[derive(clap::Args)]
+pub(crate) struct Args {
+    /// The files to look into
+    #[arg(value_name = "FILE", required = true)]
+    files: Vec<PathBuf>,
+
+    /// Print one JSON object per file, one per line
+    ///
+    /// NaN and infinities are the strings "nan", "inf" and "-inf". Text from the file is spelled byte by byte:
+    /// each byte becomes the character of that number (0 to 255), whatever its encoding. What only the values
+    /// of a grid could tell is null if they were not read; a file or grid that is damaged has a key "error".
+    #[arg(long)]
+    json: bool,
+
+    /// Add a hash of each grid's topology and one of its values
+    ///
+    /// FNV-1a, 64 bits, over origin and active mask of every leaf and over the 512 values of every leaf.
+    #[arg(long)]
+    hash: bool,
+}
+
+/// What became known of a grid's voxels.
+pub(crate) enum Contents {
+    /// All of this.
+    Decoded(Decoded),
+    /// Nothing: values of this type are not read.
+    NotDecoded,
+    /// Nothing, and this is why.
+    Damaged(String),
+}
+
+/// A grid's voxels, summed up.
+pub(crate) struct Decoded {
+    /// The value of everything that is not stored.
+    pub(crate) background: f32,
+    /// Counts, boxes and extremes.
+    pub(crate) statistics: Statistics,
+    /// Memory that the tree took, in bytes.
+    pub(crate) memory_bytes: u64,
+    /// If asked for.
+    pub(crate) hashes: Option<Hashes>,
+}
+
+/// 64-bit FNV-1a hashes of a tree.
+pub(crate) struct Hashes {
+    /// Over the origins and active masks of the leaves.
+    pub(crate) topology: u64,
+    /// Over the values of the leaves.
+    pub(crate) leaf_values: u64,
+}
+
+/// Prints what is in each file.
+///
+/// # Errors
+/// If a file or a grid cannot be read, after the others have been printed.
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    let mut out = BufWriter::new(io::stdout().lock());
+    let mut whole = true;
+    for (i, path) in args.files.iter().enumerate() {
+        match show_file(path, args, i > 0, &mut out) {
+            Ok(complete) => whole &= complete,
+            Err(failure @ Failure::File { .. }) => {
+                whole = false;
+                out.flush()?;
+                failure.report();
+            }
+            Err(failure) => return Err(failure),
+        }
+    }
+    out.flush()?;
+    if whole { Ok(()) } else { Err(Failure::Reported) }
+}
+
+/// Prints one file. Whether all its grids that should be readable are.
+fn show_file(path: &Path, args: &Args, after_another: bool, out: &mut impl Write) -> Result<bool, Failure> {
+    let opened = DiskFile::open(path);
+    let disk = opened.or_else(|failure| failed(path, failure, args, out))?;
+    let file = disk.vdb().or_else(|failure| failed(path, failure, args, out))?;
+    if !args.json {
+        if after_another {
+            writeln!(out)?;
+        }
+        text::file(out, path, disk.size(), &file)?;
+    }
+    let mut complete = true;
+    let mut grids: Vec<Value> = Vec::new();
+    for (index, info) in file.grids.iter().enumerate() {
+        let contents = look_into(&file, index, args.hash);
+        match args.json {
+            true => grids.push(json::grid(info, &contents, args.hash)),
+            false => text::grid(out, info, &contents)?,
+        }
+        if let Contents::Damaged(error) = &contents {
+            complete = false;
+            out.flush()?;
+            Failure::file(path, format!("grid '{}': {error}", info.unique_name)).report();
+        }
+    }
+    if args.json {
+        writeln!(out, "{}", json::file(path, disk.size(), &file, grids))?;
+    }
+    Ok(complete)
+}
+
+/// Says in the JSON output too that a file could not be opened.
+fn failed<T>(path: &Path, failure: Failure, args: &Args, out: &mut impl Write) -> Result<T, Failure> {
+    if let (true, Failure::File { what, .. }) = (args.json, &failure) {
+        writeln!(out, "{}", json::failed_file(path, what))?;
+    }
+    Err(failure)
+}
+
+fn look_into<S: Source>(file: &File<S>, index: usize, with_hashes: bool) -> Contents {
+    if file.grids.get(index).is_none_or(|info| !info.is_readable()) {
+        return Contents::NotDecoded;
+    }
+    match file.read_grid(index) {
+        Ok(grid) => Contents::Decoded(Decoded {
+            background: grid.tree.background,
+            statistics: grid.tree.statistics(),
+            memory_bytes: memory_bytes(&grid.tree),
+            hashes: with_hashes.then(|| Hashes {
+                topology: grid.tree.topology_hash(),
+                leaf_values: grid.tree.leaf_value_hash(),
+            }),
+        }),
+        Err(error) => Contents::Damaged(explain(&error)),
+    }
+}
+
+/// Memory that a tree's vectors hold, in bytes.
+fn memory_bytes(tree: &Tree) -> u64 {
+    let node = |node: &InternalNode| {
+        let masks = (node.child_mask.words().len() + node.value_mask.words().len()) * 10;
+        let tiles = match &node.tiles {
+            Tiles::Uniform(_) => 0,
+            Tiles::PerSlot(values) => size_of_val(&**values),
+        };
+        size_of_val(node) + masks + tiles
+    };
+    let nodes: usize = tree.nodes5.iter().chain(&tree.nodes4).map(node).sum();
+    let leaves = &tree.leaves;
+    let leaves = size_of_val(&*leaves.origins) + size_of_val(&*leaves.masks) + size_of_val(&*leaves.values);
+    (size_of_val(&*tree.root_tiles) + nodes + leaves) as u64
+}

@@ -1,0 +1,193 @@
+//! The JSON that `--json` prints: one object per file, one per probe.
+//!
+//! JSON knows neither NaN nor infinities, so they are the strings `"nan"`, `"inf"` and `"-inf"`. Strings of VDB
+//! files are bytes in no stated encoding, so each byte becomes the character of that number: nothing is lost,
+//! ASCII reads as it is.
+
+use std::path::Path;
+
+use nuage_vdb::{File, GridInfo, MetaValue, Metadata, Transform, Voxel, format_g};
+use serde_json::{Value, json};
+
+use crate::info::Contents;
+
+/// Where the transform of each grid is sampled, in index space.
+const SAMPLES: [[f64; 3]; 6] = [
+    [0.0, 0.0, 0.0],
+    [1.0, 0.0, 0.0],
+    [0.0, 1.0, 0.0],
+    [0.0, 0.0, 1.0],
+    [10.0, -20.0, 30.0],
+    [0.5, 7.25, 12.125],
+];
+
+/// A file with its grids, as [`grid`] describes them.
+pub(crate) fn file<S>(path: &Path, size_bytes: u64, file: &File<S>, grids: Vec<Value>) -> Value {
+    let [major, minor] = file.library_version;
+    json!({
+        "file": base_name(path),
+        "size": size_bytes,
+        "file_version": file.file_version,
+        "library_version": format!("{major}.{minor}"),
+        "file_metadata": metadata(&file.metadata),
+        "grids": grids,
+    })
+}
+
+/// A file that could not be opened.
+pub(crate) fn failed_file(path: &Path, error: &str) -> Value {
+    json!({ "file": base_name(path), "error": error })
+}
+
+/// A grid. What its voxels would tell is null if they were not decoded; `error` says why if they should have
+/// been.
+pub(crate) fn grid(info: &GridInfo, contents: &Contents, with_hashes: bool) -> Value {
+    let mut grid = header(info);
+    let (decoded, error) = match contents {
+        Contents::Decoded(decoded) => (Some(decoded), None),
+        Contents::NotDecoded => (None, None),
+        Contents::Damaged(error) => (None, Some(error)),
+    };
+    let stats = decoded.map(|decoded| &decoded.statistics);
+    let [min, max] =
+        stats.and_then(|s| s.min_max).map(|ends| ends.map(|v| number(v.into()))).unwrap_or_default();
+    grid["background"] = json!(decoded.map(|d| single(d.background)));
+    grid["active_voxels"] = json!(stats.map(|s| s.active_voxels));
+    grid["active_tiles"] = json!(stats.map(|s| s.active_tiles));
+    grid["node_counts_leaf_to_root"] = json!(stats.map(|s| s.node_counts_leaf_to_root));
+    grid["leaf_count"] = json!(stats.map(|s| s.node_counts_leaf_to_root[0]));
+    grid["active_bbox"] = json!(stats.map_or_else(|| info.file_bbox(), |s| s.active_bbox));
+    grid["leaf_bbox"] = json!(stats.and_then(|s| s.leaf_bbox));
+    grid["min"] = min;
+    grid["max"] = max;
+    grid["nan_count"] = json!(stats.map(|s| s.nan_count));
+    if with_hashes {
+        let hashes = decoded.and_then(|decoded| decoded.hashes.as_ref());
+        let hex = |hash: u64| format!("{hash:016x}");
+        grid["fnv1a64_topology"] = json!(hashes.map(|h| hex(h.topology)));
+        grid["fnv1a64_leaf_values"] = json!(hashes.map(|h| hex(h.leaf_values)));
+    }
+    if let Some(error) = error {
+        grid["error"] = json!(error);
+    }
+    grid
+}
+
+/// What a grid says of one index coordinate.
+pub(crate) fn probe(ijk: [i32; 3], voxel: Voxel) -> Value {
+    json!({ "ijk": ijk, "v": single(voxel.value), "on": voxel.active, "depth": voxel.depth })
+}
+
+fn header(info: &GridInfo) -> Value {
+    // The values of a mask grid are the active states themselves: OpenVDB calls them bool.
+    let value_type = match info.value_type() {
+        "mask" => "bool",
+        other => other,
+    };
+    let creator = info.metadata.get("creator").filter(|value| value.type_name == "string");
+    json!({
+        "name": characters(info.name.as_bytes()),
+        "unique_name": characters(info.unique_name.as_bytes()),
+        "grid_type": characters(info.grid_type.as_bytes()),
+        "value_type": characters(value_type.as_bytes()),
+        "grid_class": info.grid_class(),
+        "vector_type": vector_type(info),
+        "creator": creator.map_or_else(String::new, |value| characters(&value.bytes)),
+        "save_float_as_half": info.save_float_as_half,
+        "in_world_space": !info.metadata.bool("is_local_space").unwrap_or(false),
+        "transform": transform(&info.transform),
+        "metadata": metadata(&info.metadata),
+    })
+}
+
+/// How the vectors of a grid follow its transform: one of OpenVDB's five ways, by default not at all.
+fn vector_type(info: &GridInfo) -> &str {
+    match info.metadata.string("vector_type") {
+        Some(
+            known @ ("covariant"
+            | "covariant normalize"
+            | "contravariant relative"
+            | "contravariant absolute"),
+        ) => known,
+        _ => "invariant",
+    }
+}
+
+fn transform(transform: &Transform) -> Value {
+    let samples = SAMPLES.map(|index| [numbers(&index), numbers(&transform.world_from_index(index))]);
+    let mut object = json!({
+        "type": characters(transform.type_name.as_bytes()),
+        "linear": transform.matrix().is_some(),
+        "voxel_size": numbers(&transform.voxel_size()),
+    });
+    if let Some(matrix) = transform.matrix() {
+        object["mat4_row_vector"] = numbers(matrix.as_flattened());
+    }
+    object["index_to_world"] = json!(samples);
+    object
+}
+
+fn metadata(metadata: &Metadata) -> Value {
+    let entry = |(name, value): (&str, &MetaValue)| {
+        let text = characters(&value.text_bytes());
+        (characters(name.as_bytes()), json!({ "type": characters(value.type_name.as_bytes()), "str": text }))
+    };
+    Value::Object(metadata.iter().map(entry).collect())
+}
+
+fn base_name(path: &Path) -> String {
+    characters(path.file_name().unwrap_or(path.as_os_str()).as_encoded_bytes())
+}
+
+fn characters(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| char::from(*byte)).collect()
+}
+
+fn numbers(values: &[f64]) -> Value {
+    values.iter().map(|value| number(*value)).collect()
+}
+
+/// A number that parses back to exactly `x`; whole ones without a decimal point.
+fn number(x: f64) -> Value {
+    const EXACT_INTEGERS: f64 = (1u64 << 53) as f64;
+    if x.is_nan() {
+        json!("nan")
+    } else if x.is_infinite() {
+        json!(if x > 0.0 { "inf" } else { "-inf" })
+    } else if x.fract() == 0.0 && x.abs() < EXACT_INTEGERS && !(x == 0.0 && x.is_sign_negative()) {
+        json!(x as i64)
+    } else {
+        json!(x)
+    }
+}
+
+/// A single-precision number in nine digits, which tell all of them apart.
+fn single(x: f32) -> Value {
+    number(format_g(x.into(), 9).parse().unwrap_or_else(|_| x.into()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_number_parses_back_to_itself() {
+        for bits in (0..=u32::MAX).step_by(99_991) {
+            let x = f32::from_bits(bits);
+            if x.is_finite() {
+                let text = single(x).to_string();
+                assert_eq!((text.parse::<f64>().unwrap() as f32).to_bits(), bits, "{text}");
+                let text = number(x.into()).to_string();
+                assert_eq!(text.parse::<f64>().unwrap().to_bits(), f64::from(x).to_bits(), "{text}");
+            }
+        }
+        assert_eq!(number(f64::NAN), "nan");
+        assert_eq!([number(f64::INFINITY), number(f64::NEG_INFINITY)], ["inf", "-inf"]);
+        assert_eq!(json!([number(-3.0), number(0.0), number(-0.0)]).to_string(), "[-3,0,-0.0]");
+    }
+
+    #[test]
+    fn bytes_become_the_characters_of_their_numbers() {
+        assert_eq!(characters(b"a\xc3\xa9\n"), "a\u{c3}\u{a9}\n");
+    }
+}

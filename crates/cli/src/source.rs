@@ -1,0 +1,121 @@
+//! A file on disk as a source of bytes for the VDB reader.
+//!
+//! Every read names its position and length, so that one grid of a large file is read without touching the
+//! rest. No memory map: a file that shrinks while it is read is an error here, not a crash.
+
+use std::borrow::Cow;
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+
+use nuage_vdb::Source;
+
+use crate::error::Failure;
+
+/// An open file on disk.
+pub(crate) struct DiskFile {
+    path: PathBuf,
+    file: fs::File,
+    size_bytes: u64,
+}
+
+impl DiskFile {
+    /// Opens a file.
+    ///
+    /// # Errors
+    /// If there is no such file, it may not be read, or it is a folder or a pipe.
+    pub(crate) fn open(path: &Path) -> Result<Self, Failure> {
+        let cannot_open = |error| Failure::file(path, format!("cannot open the file: {error}"));
+        // Asked before opening: opening a named pipe would wait for its writer.
+        let kind = fs::metadata(path).map_err(cannot_open)?;
+        if kind.is_dir() {
+            return Err(Failure::file(path, "this is a folder: name the files in it, as in FOLDER/*.vdb"));
+        }
+        if !kind.is_file() {
+            return Err(Failure::file(path, "this is no regular file: copy it to disk first"));
+        }
+        let file = fs::File::open(path).map_err(cannot_open)?;
+        let size_bytes = file.metadata().map_err(cannot_open)?.len();
+        Ok(DiskFile { path: path.to_owned(), file, size_bytes })
+    }
+
+    /// Reads the header of the file as a VDB file.
+    ///
+    /// # Errors
+    /// If it is not a VDB file that we read.
+    pub(crate) fn vdb(&self) -> Result<nuage_vdb::File<&Self>, Failure> {
+        nuage_vdb::File::open(self).map_err(|error| Failure::vdb(&self.path, &error))
+    }
+
+    /// The path as it was given.
+    pub(crate) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// The size when the file was opened, in bytes.
+    pub(crate) fn size(&self) -> u64 {
+        self.size_bytes
+    }
+}
+
+impl Source for DiskFile {
+    fn size_bytes(&self) -> io::Result<u64> {
+        Ok(self.size_bytes)
+    }
+
+    fn range(&self, offset: u64, len: usize) -> io::Result<Cow<'_, [u8]>> {
+        let mut bytes = vec![0; len];
+        read_exact_at(&self.file, &mut bytes, offset)?;
+        Ok(Cow::Owned(bytes))
+    }
+}
+
+#[cfg(unix)]
+fn read_exact_at(file: &fs::File, bytes: &mut [u8], offset: u64) -> io::Result<()> {
+    std::os::unix::fs::FileExt::read_exact_at(file, bytes, offset)
+}
+
+#[cfg(windows)]
+fn read_exact_at(file: &fs::File, mut bytes: &mut [u8], mut offset: u64) -> io::Result<()> {
+    use std::os::windows::fs::FileExt;
+    while !bytes.is_empty() {
+        match file.seek_read(bytes, offset) {
+            Ok(0) => return Err(io::ErrorKind::UnexpectedEof.into()),
+            Ok(count) => {
+                bytes = &mut bytes[count..];
+                offset += count as u64;
+            }
+            Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+            Err(error) => return Err(error),
+        }
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Write;
+
+    use super::*;
+
+    #[test]
+    fn a_range_is_what_stands_there_and_the_end_of_the_file_is_an_error() {
+        let mut file = tempfile::NamedTempFile::new().unwrap();
+        let bytes: Vec<u8> = (0..=255).collect();
+        file.write_all(&bytes).unwrap();
+        let disk = DiskFile::open(file.path()).unwrap();
+        assert_eq!(disk.size_bytes().unwrap(), 256);
+        for (offset, len) in [(0, 256), (17, 100), (255, 1), (256, 0)] {
+            assert_eq!(*disk.range(offset as u64, len).unwrap(), bytes[offset..offset + len]);
+        }
+        // The file is shorter than it was said to be, as when it is cut off while being read.
+        file.as_file().set_len(100).unwrap();
+        assert_eq!(disk.range(50, 51).unwrap_err().kind(), io::ErrorKind::UnexpectedEof);
+    }
+
+    #[test]
+    fn a_folder_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        assert!(matches!(DiskFile::open(folder.path()), Err(Failure::File { .. })));
+    }
+}

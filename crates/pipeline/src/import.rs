@@ -1,0 +1,410 @@
+//! From a VDB grid to a channel: what each kind of grid means as a medium.
+//!
+//! - A value is a density: negative values and NaN count as 0, +∞ as the largest finite number; how many there
+//!   were is reported.
+//! - The medium ends at the box of active voxels. Inside it values count whether active or not, the background
+//!   included; outside it everything is 0.
+//! - A level set becomes a fog: 0 outside, rising to 1 at the depth of its band and beyond.
+//! - A grid without active voxels is an empty channel.
+//!
+//! Leaves that turn out constant become tiles, and those that are zero vanish.
+
+use std::collections::HashMap;
+
+use glam::{DAffine3, DMat3, DVec3, IVec3};
+use half::f16;
+use half::slice::HalfFloatSliceExt;
+use nuage_vdb::{Grid, GridInfo, LEVEL4, LEVEL5, Transform};
+use nuage_volume::brick::{BrickSummary, Bricks};
+use nuage_volume::build::{BuildError, TileSize, TreeBuilder};
+use nuage_volume::channel::{Channel, IndexBox};
+use nuage_volume::space::BRICK_VOXELS;
+
+/// The most root cells (4096³ voxels each) that a background other than zero may fill.
+const MAX_BACKGROUND_CELLS: i64 = 4096;
+
+/// Why a grid cannot become a channel.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum ImportError {
+    /// The transform is one that straight rays cannot be taken through.
+    #[error("unsupported: grid '{grid}' has a {transform}; only linear transforms can be rendered")]
+    NonlinearTransform {
+        /// The grid.
+        grid: String,
+        /// The type of its map.
+        transform: String,
+    },
+    /// The transform flattens space or holds numbers that are none.
+    #[error("grid '{grid}' has a transform that cannot be inverted")]
+    SingularTransform {
+        /// The grid.
+        grid: String,
+    },
+    /// The background is not zero and its region is too large.
+    #[error(
+        "grid '{grid}' fills {cells} cells of 4096³ voxels with its background, over the limit of {limit}"
+    )]
+    Background {
+        /// The grid.
+        grid: String,
+        /// How many cells.
+        cells: i64,
+        /// How many there may be.
+        limit: i64,
+    },
+    /// The tree became too large, or the grid's regions overlap.
+    #[error("grid '{grid}': {source}")]
+    Build {
+        /// The grid.
+        grid: String,
+        /// What went wrong.
+        source: BuildError,
+    },
+}
+
+/// What was changed on the way from grid to medium.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Report {
+    /// Stored values that were not a number and count as 0.
+    pub nan_values: u64,
+    /// Stored values below zero that count as 0; in a level set none.
+    pub negative_values: u64,
+    /// Stored values of +∞ that count as the largest finite number.
+    pub infinite_values: u64,
+    /// The depth in world units at which a level set's fog reaches 1, if the grid was one.
+    pub level_set_band: Option<f32>,
+}
+
+/// How values become densities.
+#[derive(Debug, Clone, Copy)]
+enum Meaning {
+    Density,
+    /// Signed distance; the fog reaches 1 at this depth.
+    LevelSet {
+        band: f32,
+    },
+}
+
+impl Meaning {
+    fn of(grid: &Grid) -> Self {
+        if grid.info.grid_class() != "level set" {
+            return Meaning::Density;
+        }
+        let background = grid.tree.background.abs();
+        let usable = background.is_finite() && background > 0.0;
+        // A level set's background is the width of its band: three voxels unless said otherwise.
+        let band = if usable { background } else { 3.0 * grid.info.transform.voxel_size()[0] as f32 };
+        Meaning::LevelSet { band }
+    }
+
+    fn density(self, value: f32) -> f32 {
+        match self {
+            // The comparison is false for NaN.
+            Meaning::Density if value > 0.0 => value.min(f32::MAX),
+            Meaning::LevelSet { band } if value < 0.0 => (-value / band).min(1.0),
+            _ => 0.0,
+        }
+    }
+}
+
+/// Turns a grid into a channel of density, temperature or anything else that is not negative.
+///
+/// # Errors
+/// If the transform is not linear and invertible, or the tree becomes too large.
+pub fn import(grid: Grid) -> Result<(Channel, Report), ImportError> {
+    let world_from_index = linear_transform(&grid.info)?;
+    let name = grid.info.unique_name.clone();
+    let active_box = grid
+        .tree
+        .statistics()
+        .active_bbox
+        .map(|[min, max]| IndexBox { min: IVec3::from_array(min), max: IVec3::from_array(max) });
+    let build_error = |source| ImportError::Build { grid: name.clone(), source };
+    let Some(clip) = active_box else {
+        let tree = TreeBuilder::new().finish(Bricks::F32(Vec::new())).map_err(build_error)?;
+        return Ok((Channel { tree, world_from_index, active_box }, Report::default()));
+    };
+    let meaning = Meaning::of(&grid);
+    let mut importer = Importer {
+        meaning,
+        clip,
+        builder: TreeBuilder::new(),
+        tile_bricks: Vec::new(),
+        placed: HashMap::new(),
+    };
+    importer.background(&grid)?;
+    importer.tiles(&grid).map_err(build_error)?;
+    let (bricks, report) = importer.leaves(grid).map_err(build_error)?;
+    let tree = importer.builder.finish(bricks).map_err(build_error)?;
+    Ok((Channel { tree, world_from_index, active_box }, report))
+}
+
+/// The affine transform of a grid.
+///
+/// # Errors
+/// If it is not linear or cannot be inverted.
+pub fn linear_transform(info: &GridInfo) -> Result<DAffine3, ImportError> {
+    let Transform { type_name, .. } = &info.transform;
+    let rows = info.transform.matrix().ok_or_else(|| ImportError::NonlinearTransform {
+        grid: info.unique_name.clone(),
+        transform: type_name.clone(),
+    })?;
+    // The rows of a row-vector matrix are the images of the axes.
+    let [x, y, z, translation] = rows.map(|row| DVec3::new(row[0], row[1], row[2]));
+    let affine = DAffine3 { matrix3: DMat3::from_cols(x, y, z), translation };
+    let inverse = affine.inverse();
+    match affine.is_finite() && inverse.is_finite() && affine.matrix3.determinant() != 0.0 {
+        true => Ok(affine),
+        false => Err(ImportError::SingularTransform { grid: info.unique_name.clone() }),
+    }
+}
+
+struct Importer {
+    meaning: Meaning,
+    clip: IndexBox,
+    builder: TreeBuilder,
+    /// Values of bricks that stem from tiles cut by the clip box. They come before those of the leaves.
+    tile_bricks: Vec<f32>,
+    /// Such bricks by the part that is filled and the bits of the value: many are alike.
+    placed: HashMap<(IVec3, IVec3, u32), u32>,
+}
+
+impl Importer {
+    /// Fills the clip box with the background wherever the root has no entry.
+    fn background(&mut self, grid: &Grid) -> Result<(), ImportError> {
+        let value = self.meaning.density(grid.tree.background);
+        if value == 0.0 {
+            return Ok(());
+        }
+        let (min, max): (IVec3, IVec3) = (self.clip.min >> 12, self.clip.max >> 12);
+        let cells = (max - min + 1).as_i64vec3();
+        let cells = cells.x.saturating_mul(cells.y).saturating_mul(cells.z);
+        if cells > MAX_BACKGROUND_CELLS {
+            let grid = grid.info.unique_name.clone();
+            return Err(ImportError::Background { grid, cells, limit: MAX_BACKGROUND_CELLS });
+        }
+        let tree = &grid.tree;
+        for x in min.x..=max.x {
+            for y in min.y..=max.y {
+                for z in min.z..=max.z {
+                    let origin = [x << 12, y << 12, z << 12];
+                    let stored = tree.nodes5.binary_search_by_key(&origin, |n| n.origin).is_ok()
+                        || tree.root_tiles.binary_search_by_key(&origin, |t| t.origin).is_ok();
+                    if !stored {
+                        self.constant(IVec3::from_array(origin) >> 3, TileSize::Node5, value).map_err(
+                            |source| ImportError::Build { grid: grid.info.unique_name.clone(), source },
+                        )?;
+                    }
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn tiles(&mut self, grid: &Grid) -> Result<(), BuildError> {
+        for tile in &grid.tree.root_tiles {
+            let value = self.meaning.density(tile.value);
+            self.constant(IVec3::from_array(tile.origin) >> 3, TileSize::Node5, value)?;
+        }
+        for (nodes, level, size) in
+            [(&grid.tree.nodes5, LEVEL5, TileSize::Node4), (&grid.tree.nodes4, LEVEL4, TileSize::Brick)]
+        {
+            for node in nodes {
+                for (slot, value, _) in node.tile_slots() {
+                    let value = self.meaning.density(value);
+                    if value != 0.0 {
+                        let origin = level.child_origin(node.origin, slot);
+                        self.constant(IVec3::from_array(origin) >> 3, size, value)?;
+                    }
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Adds a region of one value, cut to the clip box.
+    fn constant(&mut self, brick: IVec3, size: TileSize, value: f32) -> Result<(), BuildError> {
+        let (voxels, child) = match size {
+            TileSize::Brick => (8, None),
+            TileSize::Node4 => (128, Some((TileSize::Brick, 16, 1))),
+            TileSize::Node5 => (4096, Some((TileSize::Node4, 32, 16))),
+        };
+        let min: IVec3 = brick << 3;
+        let max = min + (voxels - 1);
+        let (inside_min, inside_max) = (min.max(self.clip.min), max.min(self.clip.max));
+        if value == 0.0 || inside_min.cmpgt(inside_max).any() {
+            return Ok(());
+        }
+        if inside_min == min && inside_max == max {
+            return self.builder.tile(brick, size, value);
+        }
+        match child {
+            Some((size, children, bricks)) => {
+                for x in 0..children {
+                    for y in 0..children {
+                        for z in 0..children {
+                            self.constant(brick + IVec3::new(x, y, z) * bricks, size, value)?;
+                        }
+                    }
+                }
+                Ok(())
+            }
+            None => self.cut_brick(brick, inside_min - min, inside_max - min, value),
+        }
+    }
+
+    fn cut_brick(&mut self, brick: IVec3, min: IVec3, max: IVec3, value: f32) -> Result<(), BuildError> {
+        let key = (min, max, value.to_bits());
+        if let Some(index) = self.placed.get(&key) {
+            return self.builder.brick_again(brick, *index);
+        }
+        let mut values = [value; BRICK_VOXELS];
+        clear_outside(&mut values, min, max);
+        self.tile_bricks.extend_from_slice(&values);
+        let index = self.builder.brick(brick, BrickSummary::of(&values))?;
+        self.placed.insert(key, index);
+        Ok(())
+    }
+
+    /// Adds all leaves; gives the values of all bricks, and what was changed.
+    fn leaves(&mut self, grid: Grid) -> Result<(Bricks, Report), BuildError> {
+        let Importer { meaning, clip, .. } = *self;
+        let leaves = grid.tree.leaves;
+        let origins = leaves.origins;
+        let mut values = leaves.values;
+        let may_be_half = grid.info.save_float_as_half && matches!(meaning, Meaning::Density);
+        let found: Vec<Leaf> = map_leaves(&mut values, &origins, |origin, values| {
+            convert_leaf(origin, values, meaning, clip, may_be_half)
+        });
+
+        let mut report = Report::default();
+        if let Meaning::LevelSet { band } = meaning {
+            report.level_set_band = Some(band);
+        }
+        let mut kept = Vec::with_capacity(found.len());
+        let mut exact_in_half =
+            may_be_half && self.tile_bricks.iter().all(|v| f16::from_f32(*v).to_f32() == *v);
+        for (i, leaf) in found.iter().enumerate() {
+            report.nan_values += u64::from(leaf.nan);
+            report.negative_values += u64::from(leaf.negative);
+            report.infinite_values += u64::from(leaf.infinite);
+            let brick = IVec3::from_array(origins[i]) >> 3;
+            let bounds = leaf.summary.low_bounds[0];
+            if !bounds.is_constant() {
+                self.builder.brick(brick, leaf.summary)?;
+                kept.push(i);
+                exact_in_half &= leaf.exact_in_half;
+            } else if bounds.max != 0.0 {
+                self.builder.tile(brick, TileSize::Brick, bounds.max)?;
+            }
+        }
+        drop(found);
+        let tile_bricks = std::mem::take(&mut self.tile_bricks);
+        let bricks = if exact_in_half {
+            let mut packed = vec![0u16; tile_bricks.len() + kept.len() * BRICK_VOXELS];
+            let (first, rest) = packed.split_at_mut(tile_bricks.len());
+            to_half_bits(&tile_bricks, first);
+            copy_kept(&values, &kept, rest, to_half_bits);
+            Bricks::F16(packed)
+        } else if tile_bricks.is_empty() && kept.len() == origins.len() {
+            Bricks::F32(values)
+        } else {
+            let mut packed = vec![0f32; tile_bricks.len() + kept.len() * BRICK_VOXELS];
+            let (first, rest) = packed.split_at_mut(tile_bricks.len());
+            first.copy_from_slice(&tile_bricks);
+            copy_kept(&values, &kept, rest, |from, to| to.copy_from_slice(from));
+            Bricks::F32(packed)
+        };
+        Ok((bricks, report))
+    }
+}
+
+/// What becomes of a leaf.
+struct Leaf {
+    summary: BrickSummary,
+    nan: u16,
+    negative: u16,
+    infinite: u16,
+    exact_in_half: bool,
+}
+
+/// Turns the values of a leaf into densities, in place.
+fn convert_leaf(
+    origin: [i32; 3],
+    values: &mut [f32; BRICK_VOXELS],
+    meaning: Meaning,
+    clip: IndexBox,
+    may_be_half: bool,
+) -> Leaf {
+    let origin = IVec3::from_array(origin);
+    let inside_min = (clip.min.saturating_sub(origin)).max(IVec3::ZERO);
+    let inside_max = (clip.max.saturating_sub(origin)).min(IVec3::splat(7));
+    if inside_min != IVec3::ZERO || inside_max != IVec3::splat(7) {
+        clear_outside(values, inside_min, inside_max);
+    }
+    let count = |test: fn(&f32) -> bool| values.iter().filter(|v| test(v)).count() as u16;
+    let nan = count(|v| v.is_nan());
+    let (negative, infinite) = match meaning {
+        Meaning::Density => (count(|v| *v < 0.0), count(|v| *v == f32::INFINITY)),
+        Meaning::LevelSet { .. } => (0, 0),
+    };
+    for value in values.iter_mut() {
+        *value = meaning.density(*value);
+    }
+    let exact_in_half = may_be_half && {
+        let mut halves = [f16::ZERO; BRICK_VOXELS];
+        let mut back = [0.0; BRICK_VOXELS];
+        halves.convert_from_f32_slice(values);
+        halves.convert_to_f32_slice(&mut back);
+        back == *values
+    };
+    Leaf { summary: BrickSummary::of(values), nan, negative, infinite, exact_in_half }
+}
+
+/// Zeroes the voxels of a brick outside the local box `[min, max]`.
+fn clear_outside(values: &mut [f32; BRICK_VOXELS], min: IVec3, max: IVec3) {
+    for (offset, value) in values.iter_mut().enumerate() {
+        let offset = offset as i32;
+        let local = IVec3::new(offset >> 6, offset >> 3 & 7, offset & 7);
+        if local.cmplt(min).any() || local.cmpgt(max).any() {
+            *value = 0.0;
+        }
+    }
+}
+
+fn to_half_bits(from: &[f32], to: &mut [u16]) {
+    use half::slice::HalfBitsSliceExt;
+    to.reinterpret_cast_mut::<f16>().convert_from_f32_slice(from);
+}
+
+/// Runs `convert` on every leaf, in parallel where the feature is on.
+fn map_leaves<T: Send>(
+    values: &mut [f32],
+    origins: &[[i32; 3]],
+    convert: impl Fn([i32; 3], &mut [f32; BRICK_VOXELS]) -> T + Sync,
+) -> Vec<T> {
+    let convert = |(values, origin): (&mut [f32], &[i32; 3])| {
+        convert(*origin, values.try_into().expect("512 values per leaf"))
+    };
+    #[cfg(feature = "parallel")]
+    {
+        use rayon::prelude::*;
+        values.par_chunks_exact_mut(BRICK_VOXELS).zip(origins).with_min_len(64).map(convert).collect()
+    }
+    #[cfg(not(feature = "parallel"))]
+    values.chunks_exact_mut(BRICK_VOXELS).zip(origins).map(convert).collect()
+}
+
+/// Copies the values of some leaves side by side.
+fn copy_kept<T: Send>(values: &[f32], kept: &[usize], to: &mut [T], copy: impl Fn(&[f32], &mut [T]) + Sync) {
+    let copy = |(to, leaf): (&mut [T], &usize)| {
+        copy(&values[leaf * BRICK_VOXELS..(leaf + 1) * BRICK_VOXELS], to);
+    };
+    #[cfg(feature = "parallel")]
+    {
+        use rayon::prelude::*;
+        to.par_chunks_exact_mut(BRICK_VOXELS).zip(kept).with_min_len(64).for_each(copy);
+    }
+    #[cfg(not(feature = "parallel"))]
+    to.chunks_exact_mut(BRICK_VOXELS).zip(kept).for_each(copy);
+}

@@ -1,0 +1,70 @@
+//! Which grid of a file a user means.
+
+use nuage_vdb::{File, Source};
+
+/// Why no grid was found.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum SelectError {
+    /// No grid has that name.
+    #[error("grid '{name}' not found; the file has: {available}")]
+    NotFound {
+        /// What was asked for.
+        name: String,
+        /// The names that exist, separated by commas.
+        available: String,
+    },
+    /// Nothing that can be drawn.
+    #[error("the file has no float grid to draw; it has: {available}")]
+    NoFloatGrid {
+        /// The names and types that exist, separated by commas.
+        available: String,
+    },
+}
+
+/// The grid of that name: a unique name (`density[1]`), else the first grid of that plain name.
+///
+/// # Errors
+/// If there is none.
+pub fn named_grid<S: Source>(file: &File<S>, name: &str) -> Result<usize, SelectError> {
+    file.find(name).ok_or_else(|| {
+        let names: Vec<&str> = file.grids.iter().map(|grid| grid.unique_name.as_str()).collect();
+        let available = if names.is_empty() { "no grids".to_owned() } else { names.join(", ") };
+        SelectError::NotFound { name: name.to_owned(), available }
+    })
+}
+
+/// The grid to draw when none is named: `density`, else the first fog volume, else the first level set, else
+/// the first float grid.
+///
+/// # Errors
+/// If the file has no float grid.
+pub fn density_grid<S: Source>(file: &File<S>) -> Result<usize, SelectError> {
+    let readable = |index: &usize| file.grids[*index].is_readable();
+    let of_class = |class: &str| {
+        (0..file.grids.len()).filter(readable).find(|index| file.grids[*index].grid_class() == class)
+    };
+    file.find("density")
+        .filter(readable)
+        .or_else(|| of_class("fog volume"))
+        .or_else(|| of_class("level set"))
+        .or_else(|| (0..file.grids.len()).find(readable))
+        .ok_or_else(|| {
+            let names: Vec<String> = file
+                .grids
+                .iter()
+                .map(|grid| format!("{} ({})", grid.unique_name, grid.value_type()))
+                .collect();
+            let available = if names.is_empty() { "no grids".to_owned() } else { names.join(", ") };
+            SelectError::NoFloatGrid { available }
+        })
+}
+
+/// The unique names of all grids that share the plain name of grid `index`.
+pub fn namesakes<S: Source>(file: &File<S>, index: usize) -> Vec<&str> {
+    let Some(grid) = file.grids.get(index) else { return Vec::new() };
+    file.grids
+        .iter()
+        .filter(|other| other.name == grid.name)
+        .map(|other| other.unique_name.as_str())
+        .collect()
+}

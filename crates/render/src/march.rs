@@ -1,0 +1,403 @@
+//! The ray marcher: single scattering, deterministic.
+//!
+//! Along a camera ray, light from sun and sky that the medium scatters once, and light that it emits, are
+//! summed up and weighed by the transmittance to the camera. Steps lie on a lattice of equal steps that is
+//! shifted per pixel by a hash; each is a sample at its middle, with the light inside the step integrated
+//! under the assumption that the step is homogeneous, so that no energy is lost whatever its length (Hillaire,
+//! "Physically Based and Unified Volumetric Rendering in Frostbite", 2015). Homogeneous runs are integrated in
+//! closed form.
+//!
+//! The sun's share takes a shadow ray per step. The sky's takes a fixed number of shadow rays per camera ray,
+//! placed so that each stands for the same share of the scattered light, in directions drawn from the phase
+//! function: the mean is right, and the cost does not grow with the number of steps.
+//!
+//! What does not live here: pixels, threads, pictures ([`crate::picture`]).
+
+use glam::Vec3;
+use nuage_volume::accessor::Accessor;
+
+use crate::camera::Ray;
+use crate::hash::{hash_u32, unit_f32};
+use crate::math::{exp, one_minus_exp_neg};
+use crate::phase::{hg, sample_hg};
+use crate::scene::{Emission, Scene};
+use crate::traverse::{Field, LocalRay, Run, RunKind, Runs};
+
+/// A camera ray ends where less of the light behind passes than this.
+const MIN_TRANSMITTANCE: f32 = 1e-4;
+/// A shadow ray ends where its optical depth is more than this: less than 1.3e-4 of the light passes.
+const MAX_SHADOW_DEPTH: f32 = 9.0;
+/// In a homogeneous run the light is looked up again after this optical depth, …
+const LIT_PIECE_DEPTH: f32 = 0.25;
+/// … or after this many voxels, whichever is shorter.
+const LIT_PIECE_VOXELS: f32 = 8.0;
+
+/// How finely a picture is computed.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Quality {
+    /// The length of a step of a camera ray, in voxels.
+    pub step_voxels: f32,
+    /// The length of a step of a shadow ray, in voxels.
+    pub shadow_step_voxels: f32,
+    /// Shadow rays towards the sky per camera ray.
+    pub sky_rays: u32,
+    /// Camera rays per pixel.
+    pub samples: u32,
+}
+
+impl Default for Quality {
+    fn default() -> Self {
+        Quality { step_voxels: 0.5, shadow_step_voxels: 1.0, sky_rays: 8, samples: 4 }
+    }
+}
+
+/// The light that reaches the camera along a ray.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Radiance {
+    /// From the medium.
+    pub scattered: Vec3,
+    /// The share of the light behind the medium that passes.
+    pub transmittance: f32,
+}
+
+/// A scene made ready for marching.
+pub struct Marcher<'s> {
+    scene: &'s Scene<'s>,
+    quality: Quality,
+    density: Option<Field<'s>>,
+    emission: Option<(Field<'s>, &'s Emission<'s>)>,
+    sky: Option<Vec3>,
+}
+
+/// What one thread needs to march: readers that remember where they were.
+pub struct Worker<'s> {
+    density: Option<Accessor<'s>>,
+    shadow: Option<Accessor<'s>>,
+    emission: Option<Accessor<'s>>,
+}
+
+/// The light on the medium along one camera ray.
+struct Lighting<'m, 's> {
+    marcher: &'m Marcher<'s>,
+    density: &'m Field<'s>,
+    /// The camera ray's direction in world space.
+    view: Vec3,
+    /// The sun: its irradiance times albedo times phase function, and its direction in the field's positions.
+    sun: Option<(Vec3, Vec3)>,
+    /// The sky's radiance times albedo.
+    sky: Option<Vec3>,
+    /// The share of scattered light at which the next ray goes to the sky.
+    next_sky: f32,
+    /// The share of scattered light so far.
+    scattered: f32,
+    sky_index: u32,
+    random: u32,
+}
+
+impl<'s> Marcher<'s> {
+    /// Makes a scene ready.
+    pub fn new(scene: &'s Scene<'s>, quality: Quality) -> Self {
+        let emission = scene.medium.emission.as_ref();
+        let sky = Vec3::from_array(scene.sky);
+        Marcher {
+            scene,
+            quality,
+            density: Field::new(scene.medium.density),
+            emission: emission.and_then(|e| Some((Field::new(e.channel)?, e))),
+            sky: (sky != Vec3::ZERO && quality.sky_rays > 0).then_some(sky),
+        }
+    }
+
+    /// What a thread needs to call the other functions.
+    pub fn worker(&self) -> Worker<'s> {
+        Worker {
+            density: self.density.as_ref().map(Field::accessor),
+            shadow: self.density.as_ref().map(Field::accessor),
+            emission: self.emission.as_ref().map(|(field, _)| field.accessor()),
+        }
+    }
+
+    /// The light along a camera ray. `random` shifts the steps and turns the rays to the sky.
+    pub fn radiance(&self, worker: &mut Worker<'s>, ray: &Ray, random: u32) -> Radiance {
+        let mut result = Radiance { scattered: Vec3::ZERO, transmittance: 1.0 };
+        let density = self.density.as_ref().and_then(|field| Some((field, field.interval(ray)?)));
+        let emission = self.emission.as_ref().and_then(|(field, e)| Some((field, *e, field.interval(ray)?)));
+        // Distances along the ray count from where it first meets the medium: precise from any camera.
+        let starts = [density.as_ref().map(|d| d.1[0]), emission.as_ref().map(|e| e.2[0])];
+        let Some(start) = starts.into_iter().flatten().reduce(f64::min) else { return result };
+        let span = |interval: [f64; 2]| interval.map(|t| (t - start) as f32);
+
+        let mut density = density.map(|(field, interval)| (field, field.local(ray, start), span(interval)));
+        let mut emission = emission.map(|(field, e, i)| (field, e, field.local(ray, start), span(i)));
+        let scale = self.scene.medium.density_scale;
+        let voxels_per_length = [
+            density.as_ref().map_or(0.0, |(_, local, _)| local.direction.length()),
+            emission.as_ref().map_or(0.0, |(_, _, local, _)| local.direction.length()),
+        ];
+        let voxels_per_length = voxels_per_length[0].max(voxels_per_length[1]);
+        let lattice =
+            Lattice { step: self.quality.step_voxels / voxels_per_length, shift: unit_f32(hash_u32(random)) };
+        let mut lighting = density.as_ref().map(|(field, ..)| Lighting::new(self, field, ray, random));
+
+        // Two readers per channel: one finds the runs, the other samples them.
+        let Worker { density: sampler, shadow, emission: glow } = worker;
+        let mut run_reader = density.as_ref().map(|(field, ..)| field.accessor());
+        let mut glow_reader = emission.as_ref().map(|(field, ..)| field.accessor());
+        let density_runs = density
+            .as_mut()
+            .zip(run_reader.as_mut())
+            .map(|((field, local, [t0, t1]), reader)| field.runs(reader, *local, *t0, *t1));
+        let emission_runs = emission
+            .as_mut()
+            .zip(glow_reader.as_mut())
+            .map(|((field, _, local, [t0, t1]), reader)| field.runs(reader, *local, *t0, *t1));
+        let lit = lighting.as_ref().is_some_and(Lighting::is_lit);
+        for piece in Pieces::new(density_runs, emission_runs) {
+            let density_kind = piece.kinds[0];
+            let emission_kind = piece.kinds[1];
+            let varying = density_kind == Some(RunKind::Varying) || emission_kind == Some(RunKind::Varying);
+            let constant = |kind| match kind {
+                Some(RunKind::Constant(value)) => value,
+                _ => 0.0,
+            };
+            let mut step = |t0: f32, t1: f32| {
+                let t = 0.5 * (t0 + t1);
+                let value = match (density_kind, &density, sampler.as_mut()) {
+                    (Some(RunKind::Varying), Some((field, local, _)), Some(sampler)) => {
+                        field.sample(sampler, local.at(t))
+                    }
+                    (kind, ..) => constant(kind),
+                };
+                let emitted = match (emission_kind, &emission, glow.as_mut()) {
+                    (None, ..) | (_, None, _) => Vec3::ZERO,
+                    (Some(RunKind::Varying), Some((field, e, local, _)), Some(glow)) => {
+                        e.spectrum.radiance(field.sample(glow, local.at(t)))
+                    }
+                    (kind, Some((_, e, ..)), _) => e.spectrum.radiance(constant(kind)),
+                };
+                let length = t1 - t0;
+                let depth = (value * scale * length).min(f32::MAX);
+                if depth <= 0.0 {
+                    result.scattered += result.transmittance * length * emitted;
+                    return true;
+                }
+                let absorbed = one_minus_exp_neg(depth);
+                let share = result.transmittance * absorbed;
+                if let (Some(lighting), Some((_, local, _)), Some(shadow)) =
+                    (&mut lighting, &density, shadow.as_mut())
+                {
+                    result.scattered += lighting.scattered(shadow, local.at(t), share);
+                }
+                // ∫ e^(−σt) dt over the step is absorbed / σ.
+                result.scattered += result.transmittance * (length * (absorbed / depth)) * emitted;
+                result.transmittance *= 1.0 - absorbed;
+                result.transmittance > MIN_TRANSMITTANCE
+            };
+            let goes_on = if varying {
+                lattice.steps(piece.t0, piece.t1, &mut step)
+            } else {
+                let length = piece.t1 - piece.t0;
+                let depth = constant(density_kind) * scale * length;
+                let pieces = (depth / LIT_PIECE_DEPTH).max(length * voxels_per_length / LIT_PIECE_VOXELS);
+                let pieces = if lit && depth > 0.0 { pieces.ceil().clamp(1.0, 65536.0) } else { 1.0 };
+                let at = |i: f32| if i < pieces { piece.t0 + length * (i / pieces) } else { piece.t1 };
+                (0..pieces as u32).all(|i| step(at(i as f32), at(i as f32 + 1.0)))
+            };
+            if !goes_on {
+                break;
+            }
+        }
+        result
+    }
+
+    /// The optical depth of a camera ray per unit of density scale.
+    pub fn depth_per_scale(&self, worker: &mut Worker<'s>, ray: &Ray) -> f32 {
+        let (Some(field), Some(reader)) = (&self.density, &mut worker.shadow) else { return 0.0 };
+        let Some([start, end]) = field.interval(ray) else { return 0.0 };
+        let local = field.local(ray, start);
+        let lattice = Lattice::new(self.quality.step_voxels, &local, 0.5);
+        optical_depth(field, reader, &local, (end - start) as f32, lattice, 1.0, f32::INFINITY)
+    }
+}
+
+/// The optical depth of a ray from t = 0 to `end`, given up once it passes `limit`.
+fn optical_depth<'s>(
+    field: &Field<'s>,
+    sampler: &mut Accessor<'s>,
+    ray: &LocalRay,
+    end: f32,
+    lattice: Lattice,
+    scale: f32,
+    limit: f32,
+) -> f32 {
+    let mut depth = 0.0;
+    let mut reader = sampler.clone();
+    for run in field.runs(&mut reader, *ray, 0.0, end) {
+        match run.kind {
+            RunKind::Constant(value) => depth += value * scale * (run.t1 - run.t0),
+            RunKind::Varying => {
+                lattice.steps(run.t0, run.t1, &mut |t0, t1| {
+                    let value = field.sample(sampler, ray.at(0.5 * (t0 + t1)));
+                    depth += value * scale * (t1 - t0);
+                    depth <= limit
+                });
+            }
+        }
+        if depth > limit {
+            break;
+        }
+    }
+    depth
+}
+
+impl<'m, 's> Lighting<'m, 's> {
+    fn new(marcher: &'m Marcher<'s>, density: &'m Field<'s>, ray: &Ray, random: u32) -> Self {
+        let medium = &marcher.scene.medium;
+        let albedo = Vec3::from_array(medium.albedo);
+        let view = ray.direction.as_vec3();
+        let sun = marcher.scene.sun.as_ref().map(|sun| {
+            // Light travels along −direction_to before and −view after it is scattered.
+            let phase = hg(sun.direction_to.dot(view), medium.phase_g);
+            (Vec3::from_array(sun.irradiance) * albedo * phase, density.directions() * sun.direction_to)
+        });
+        let rays = marcher.quality.sky_rays.max(1) as f32;
+        Lighting {
+            marcher,
+            density,
+            view,
+            sun: sun.filter(|(light, _)| *light != Vec3::ZERO),
+            sky: marcher.sky.map(|sky| sky * albedo).filter(|light| *light != Vec3::ZERO),
+            next_sky: unit_f32(hash_u32(random ^ 0x5bd1_e995)) / rays,
+            scattered: 0.0,
+            sky_index: 0,
+            random,
+        }
+    }
+
+    fn is_lit(&self) -> bool {
+        self.sun.is_some() || self.sky.is_some()
+    }
+
+    /// The light scattered towards the camera at a position that accounts for `share` of the camera's light.
+    fn scattered(&mut self, shadow: &mut Accessor<'s>, position: Vec3, share: f32) -> Vec3 {
+        let mut light = Vec3::ZERO;
+        if let Some((radiance, direction)) = self.sun {
+            light += radiance * share * self.transmittance(shadow, position, direction);
+        }
+        if let Some(radiance) = self.sky {
+            self.scattered += share;
+            let rays = self.marcher.quality.sky_rays as f32;
+            while self.scattered > self.next_sky {
+                self.next_sky += 1.0 / rays;
+                let direction = self.sky_direction();
+                light += radiance / rays * self.transmittance(shadow, position, direction);
+            }
+        }
+        light
+    }
+
+    /// The next direction towards the sky, in the field's positions, drawn from the phase function.
+    fn sky_direction(&mut self) -> Vec3 {
+        // The additive recurrence of the plastic number (Roberts, "The Unreasonable Effectiveness of
+        // Quasirandom Sequences", 2018), started anew for each camera ray.
+        let sequence =
+            |start: u32, step: u32| unit_f32(start.wrapping_add(self.sky_index.wrapping_mul(step)));
+        let start = hash_u32(self.random ^ 0x2545_f491);
+        let u = [sequence(start, 0xc13f_a9a9), sequence(hash_u32(start), 0x91e1_0da5)];
+        self.sky_index += 1;
+        let direction = sample_hg(self.view, self.marcher.scene.medium.phase_g, u);
+        self.density.directions() * direction
+    }
+
+    fn transmittance(&self, shadow: &mut Accessor<'s>, position: Vec3, direction: Vec3) -> f32 {
+        let ray = LocalRay::new(position, direction);
+        // The position itself scrambles the lattice, so that neighbouring steps do not share its error.
+        let bits = position.x.to_bits()
+            ^ position.y.to_bits().rotate_left(11)
+            ^ position.z.to_bits().rotate_left(22);
+        let shift = unit_f32(hash_u32(self.random ^ bits));
+        let lattice = Lattice::new(self.marcher.quality.shadow_step_voxels, &ray, shift);
+        let scale = self.marcher.scene.medium.density_scale;
+        let end = self.density.exit(&ray);
+        exp(-optical_depth(self.density, shadow, &ray, end, lattice, scale, MAX_SHADOW_DEPTH))
+    }
+}
+
+/// Where steps end: at `(k + shift) × step` for all integers k.
+#[derive(Debug, Clone, Copy)]
+struct Lattice {
+    step: f32,
+    shift: f32,
+}
+
+impl Lattice {
+    fn new(step_voxels: f32, ray: &LocalRay, shift: f32) -> Self {
+        Lattice { step: step_voxels / ray.direction.length(), shift }
+    }
+
+    /// Calls `step(t0, t1)` for all steps between `start` and `end`, the first and last cut to them, until it
+    /// returns false; returns whether it never did.
+    #[inline]
+    fn steps(self, start: f32, end: f32, step: &mut impl FnMut(f32, f32) -> bool) -> bool {
+        // A million steps at most, which single precision can still count.
+        let length = self.step.max(end * 1e-6);
+        let mut k = (start / length - self.shift) as i32;
+        let mut t0 = start;
+        while t0 < end {
+            k += 1;
+            let t1 = ((k as f32 + self.shift) * length).min(end);
+            // Where rounding makes a step empty it is passed over.
+            if t1 > t0 {
+                if !step(t0, t1) {
+                    return false;
+                }
+                t0 = t1;
+            }
+        }
+        true
+    }
+}
+
+/// A stretch of a ray on which each channel is of one kind.
+struct Piece {
+    t0: f32,
+    t1: f32,
+    kinds: [Option<RunKind>; 2],
+}
+
+/// The runs of two channels along one ray, cut where either begins or ends.
+struct Pieces<'r, 'a> {
+    runs: [Option<Runs<'r, 'a>>; 2],
+    heads: [Option<Run>; 2],
+}
+
+impl<'r, 'a> Pieces<'r, 'a> {
+    fn new(first: Option<Runs<'r, 'a>>, second: Option<Runs<'r, 'a>>) -> Self {
+        let mut runs = [first, second];
+        let heads = runs.each_mut().map(|runs| runs.as_mut().and_then(Iterator::next));
+        Pieces { runs, heads }
+    }
+}
+
+impl Iterator for Pieces<'_, '_> {
+    type Item = Piece;
+
+    fn next(&mut self) -> Option<Piece> {
+        let t0 = self.heads.iter().flatten().map(|run| run.t0).reduce(f32::min)?;
+        // The piece ends where a run that covers its start ends, or where another begins.
+        let cuts = self.heads.iter().flatten().map(|run| if run.t0 > t0 { run.t0 } else { run.t1 });
+        let t1 = cuts.reduce(f32::min)?;
+        let kinds = self.heads.map(|head| head.filter(|run| run.t0 <= t0).map(|run| run.kind));
+        for (head, runs) in self.heads.iter_mut().zip(&mut self.runs) {
+            if let Some(run) = head
+                && run.t0 <= t0
+            {
+                run.t0 = t1;
+                if run.t0 >= run.t1 {
+                    *head = runs.as_mut().and_then(Iterator::next);
+                }
+            }
+        }
+        Some(Piece { t0, t1, kinds })
+    }
+}

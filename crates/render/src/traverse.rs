@@ -1,0 +1,308 @@
+//! The walk of a ray through a tree: a hierarchical DDA that yields what is not empty.
+//!
+//! Integrators see a channel only as [`Run`]s along a ray, each either homogeneous or to be sampled. The walk
+//! steps from region to region, as large as the tree has them; a region whose trilinear footprint is zero
+//! costs one look-up. Large tiles are homogeneous but for the layer of cells at their high faces, where
+//! samples blend with the neighbours.
+//!
+//! After Amanatides & Woo, "A Fast Voxel Traversal Algorithm for Ray Tracing", 1987, and Museth, "Hierarchical
+//! Digital Differential Analyzer for Efficient Ray-Marching in OpenVDB", 2014.
+
+use glam::{DMat3, DVec3, IVec3, Mat3, Vec3};
+use nuage_volume::accessor::Accessor;
+use nuage_volume::channel::Channel;
+use nuage_volume::tree::Content;
+
+use crate::camera::Ray;
+
+/// A channel made ready for rays: its transform inverted, its extent in the coordinates of the walk.
+///
+/// Positions of the walk are index coordinates relative to the first voxel of `base_brick`, so that single
+/// precision suffices wherever a volume lies.
+#[derive(Debug, Clone)]
+pub struct Field<'a> {
+    channel: &'a Channel,
+    index_from_world: DMat3,
+    /// World origin in positions of the walk.
+    offset: DVec3,
+    base_brick: IVec3,
+    /// The first and last brick that a sample other than zero can lie in.
+    brick_box: [IVec3; 2],
+    /// Where samples can be other than zero, as positions.
+    bounds: [DVec3; 2],
+}
+
+/// A ray in the positions of a [`Field`], `p(t) = origin + t × direction`.
+#[derive(Debug, Clone, Copy)]
+pub struct LocalRay {
+    /// The position at t = 0.
+    pub origin: Vec3,
+    /// Voxels per unit of t, which is world length.
+    pub direction: Vec3,
+    inverse: Vec3,
+}
+
+/// A stretch of a ray.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Run {
+    /// Where it begins.
+    pub t0: f32,
+    /// Where it ends.
+    pub t1: f32,
+    /// What it holds.
+    pub kind: RunKind,
+}
+
+/// What a stretch of a ray holds.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum RunKind {
+    /// One value everywhere.
+    Constant(f32),
+    /// Values to be sampled.
+    Varying,
+}
+
+impl<'a> Field<'a> {
+    /// Makes a channel ready. `None` if it has no active voxel or is zero everywhere.
+    pub fn new(channel: &'a Channel) -> Option<Self> {
+        let active = channel.active_box?;
+        if channel.tree.root.is_empty() {
+            return None;
+        }
+        // Interpolation reaches one voxel beyond the box on both sides.
+        let (min, max) = (active.min.saturating_sub(IVec3::ONE), active.max);
+        let base_brick: IVec3 = min >> 3;
+        let base: IVec3 = base_brick << 3;
+        let base = base.as_dvec3();
+        let inverse = channel.world_from_index.inverse();
+        Some(Field {
+            channel,
+            index_from_world: inverse.matrix3,
+            offset: inverse.translation - base,
+            base_brick,
+            brick_box: [base_brick, max >> 3],
+            bounds: [min.as_dvec3() - base, max.as_dvec3() + 1.0 - base],
+        })
+    }
+
+    /// A reader of the values.
+    pub fn accessor(&self) -> Accessor<'a> {
+        Accessor::new(&self.channel.tree)
+    }
+
+    /// Where a ray enters and leaves the field, as distances from its origin.
+    pub fn interval(&self, ray: &Ray) -> Option<[f64; 2]> {
+        let origin = self.index_from_world * ray.origin + self.offset;
+        let direction = self.index_from_world * ray.direction;
+        let [mut t0, mut t1] = [0.0f64, f64::INFINITY];
+        for axis in 0..3 {
+            let (low, high) = (self.bounds[0][axis], self.bounds[1][axis]);
+            if direction[axis] == 0.0 {
+                if origin[axis] < low || origin[axis] > high {
+                    return None;
+                }
+                continue;
+            }
+            let a = (low - origin[axis]) / direction[axis];
+            let b = (high - origin[axis]) / direction[axis];
+            t0 = t0.max(a.min(b));
+            t1 = t1.min(a.max(b));
+        }
+        (t0 < t1).then_some([t0, t1])
+    }
+
+    /// The ray in positions of this field, with t = 0 moved to the distance `start`.
+    pub fn local(&self, ray: &Ray, start: f64) -> LocalRay {
+        let origin = self.index_from_world * (ray.origin + ray.direction * start) + self.offset;
+        LocalRay::new(origin.as_vec3(), (self.index_from_world * ray.direction).as_vec3())
+    }
+
+    /// Takes directions of the world to positions of this field.
+    pub fn directions(&self) -> Mat3 {
+        self.index_from_world.as_mat3()
+    }
+
+    /// Where a ray that starts inside leaves the field.
+    #[inline]
+    pub fn exit(&self, ray: &LocalRay) -> f32 {
+        let far =
+            Vec3::select(ray.direction.cmpge(Vec3::ZERO), self.bounds[1].as_vec3(), self.bounds[0].as_vec3());
+        // NaN arises on an axis along which nothing moves; min() passes over it.
+        let t = (far - ray.origin) * ray.inverse;
+        f32::INFINITY.min(t.x).min(t.y).min(t.z)
+    }
+
+    /// The value at a position.
+    #[inline]
+    pub fn sample(&self, accessor: &mut Accessor<'a>, position: Vec3) -> f32 {
+        let cell = IVec3::new(floor(position.x), floor(position.y), floor(position.z));
+        let fraction = position - cell.as_vec3();
+        accessor.trilinear_in_cell(cell.wrapping_add(self.base_brick << 3), fraction)
+    }
+
+    /// The runs of a ray between `t0` and `t1`, both inside the field.
+    pub fn runs<'r>(&self, accessor: &'r mut Accessor<'a>, ray: LocalRay, t0: f32, t1: f32) -> Runs<'r, 'a> {
+        let position = (ray.origin + ray.direction * t0) * 0.125;
+        let brick = IVec3::new(floor(position.x), floor(position.y), floor(position.z));
+        Runs {
+            accessor,
+            ray,
+            base_brick: self.base_brick,
+            brick_box: self.brick_box,
+            brick: brick.wrapping_add(self.base_brick).clamp(self.brick_box[0], self.brick_box[1]),
+            t: t0,
+            t_end: t1,
+            split: None,
+            held: None,
+        }
+    }
+}
+
+impl LocalRay {
+    /// A ray from a position along a direction.
+    #[inline]
+    pub fn new(origin: Vec3, direction: Vec3) -> Self {
+        LocalRay { origin, direction, inverse: direction.recip() }
+    }
+
+    /// The position at t.
+    #[inline]
+    pub fn at(&self, t: f32) -> Vec3 {
+        self.origin + self.direction * t
+    }
+
+    /// Where the ray enters and leaves a box; empty if it misses.
+    fn box_interval(&self, low: Vec3, high: Vec3) -> [f32; 2] {
+        let a = (low - self.origin) * self.inverse;
+        let b = (high - self.origin) * self.inverse;
+        let (near, far) = (a.min(b), a.max(b));
+        // Where nothing moves along an axis, one of both is NaN or both are infinite; max() and min() pass
+        // over NaN.
+        let t0 = f32::NEG_INFINITY.max(near.x).max(near.y).max(near.z);
+        let t1 = f32::INFINITY.min(far.x).min(far.y).min(far.z);
+        [t0, t1]
+    }
+}
+
+/// The largest integer not above x. `f32::floor` is a library call without SSE 4.1.
+#[inline]
+fn floor(x: f32) -> i32 {
+    let i = x as i32;
+    i.saturating_sub(i32::from(x < i as f32))
+}
+
+/// The iterator of [`Field::runs`].
+#[derive(Debug)]
+pub struct Runs<'r, 'a> {
+    accessor: &'r mut Accessor<'a>,
+    ray: LocalRay,
+    base_brick: IVec3,
+    brick_box: [IVec3; 2],
+    /// The brick to look at next, and where the ray enters it.
+    brick: IVec3,
+    t: f32,
+    t_end: f32,
+    /// What is left of a large tile: the homogeneous part and the layer behind it.
+    split: Option<[Run; 2]>,
+    /// A varying run that may go on.
+    held: Option<Run>,
+}
+
+impl Runs<'_, '_> {
+    /// The next stretch that is not empty, one region at a time.
+    fn next_stretch(&mut self) -> Option<Run> {
+        if let Some([first, second]) = self.split.take() {
+            if first.t0 < first.t1 {
+                self.split = Some([Run { t1: first.t0, ..first }, second]);
+                return Some(first);
+            }
+            if second.t0 < second.t1 {
+                return Some(second);
+            }
+        }
+        while self.t < self.t_end {
+            let region = self.accessor.region(self.brick);
+            let extent = 1 << region.log2_bricks;
+            let origin = self.brick & !(extent - 1);
+            let low = (origin - self.base_brick).as_vec3() * 8.0;
+            let high = low + (extent * 8) as f32;
+            let t0 = self.t;
+            self.step(origin, extent, low, high);
+            let t1 = self.t.min(self.t_end);
+            if t0 >= t1 {
+                continue;
+            }
+            let bounds = region.footprint;
+            if bounds.is_constant() {
+                if bounds.max != 0.0 {
+                    return Some(Run { t0, t1, kind: RunKind::Constant(bounds.max) });
+                }
+                continue;
+            }
+            match region.content {
+                Content::Constant(value) if extent > 1 => {
+                    let [a, b] = self.ray.box_interval(low, high - 1.0);
+                    // A ray that misses the homogeneous part has its whole stretch in the layer.
+                    let (a, b) = if a < b { (a.clamp(t0, t1), b.clamp(t0, t1)) } else { (t1, t1) };
+                    let layer = |t0, t1| Run { t0, t1, kind: RunKind::Varying };
+                    let middle = if value == 0.0 { b } else { a };
+                    let first = Run { t0: middle, t1: b, kind: RunKind::Constant(value) };
+                    self.split = Some([first, layer(b, t1)]);
+                    if t0 < a {
+                        return Some(layer(t0, a));
+                    }
+                    return self.next_stretch();
+                }
+                _ => return Some(Run { t0, t1, kind: RunKind::Varying }),
+            }
+        }
+        None
+    }
+
+    /// Moves on to where the ray leaves a region, and to the brick behind.
+    #[inline]
+    fn step(&mut self, origin: IVec3, extent: i32, low: Vec3, high: Vec3) {
+        let forward = self.ray.direction.cmpge(Vec3::ZERO);
+        let t = (Vec3::select(forward, high, low) - self.ray.origin) * self.ray.inverse;
+        // An axis along which nothing moves never comes first.
+        let t = Vec3::select(self.ray.direction.cmpeq(Vec3::ZERO), Vec3::INFINITY, t);
+        let axis = if t.x <= t.y && t.x <= t.z {
+            0
+        } else if t.y <= t.z {
+            1
+        } else {
+            2
+        };
+        self.t = self.t.max(t[axis]);
+        let position = self.ray.at(self.t) * 0.125;
+        let brick = IVec3::new(floor(position.x), floor(position.y), floor(position.z));
+        let last = origin + (extent - 1);
+        self.brick = brick.wrapping_add(self.base_brick).clamp(origin, last);
+        // The axis of the exit moves by the integers, so that the walk never stands still.
+        self.brick[axis] = if forward.test(axis) { last[axis] + 1 } else { origin[axis] - 1 };
+        let inside = self.brick.cmpge(self.brick_box[0]).all() && self.brick.cmple(self.brick_box[1]).all();
+        if !inside {
+            self.t_end = self.t_end.min(self.t);
+        }
+    }
+}
+
+impl Iterator for Runs<'_, '_> {
+    type Item = Run;
+
+    /// Varying stretches that touch come as one run.
+    #[inline]
+    fn next(&mut self) -> Option<Run> {
+        let mut run = self.held.take().or_else(|| self.next_stretch())?;
+        if run.kind == RunKind::Varying {
+            while let Some(next) = self.next_stretch() {
+                if next.kind != RunKind::Varying || next.t0 != run.t1 {
+                    self.held = Some(next);
+                    break;
+                }
+                run.t1 = next.t1;
+            }
+        }
+        Some(run)
+    }
+}

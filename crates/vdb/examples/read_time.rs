@@ -1,0 +1,47 @@
+//! Times reading every grid of a file: `cargo run --release -p nuage-vdb --example read_time -- FILE REPEATS`.
+//!
+//! Prints one line, `median_ms=... min_ms=... grids=... active_voxels=...`. Getting the bytes from the file system
+//! is timed, freeing the grids is not. `bench/read_vs_openvdb.sh` sets it beside OpenVDB's own reader.
+
+#![allow(clippy::print_stdout, reason = "the line printed is what the program is for")]
+
+use std::error::Error;
+use std::time::Instant;
+
+use nuage_vdb::{File, Grid};
+
+fn read_all_grids(path: &str) -> Result<Vec<Grid>, Box<dyn Error>> {
+    let file = File::open(std::fs::read(path)?)?;
+    let grids: nuage_vdb::Result<Vec<Grid>> = (0..file.grids.len()).map(|i| file.read_grid(i)).collect();
+    Ok(grids?)
+}
+
+fn median(sorted: &[f64]) -> Option<f64> {
+    let upper = sorted.get(sorted.len() / 2)?;
+    let lower = sorted.get((sorted.len() - 1) / 2)?;
+    Some((lower + upper) / 2.0)
+}
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let [path, repeats] = arguments.as_slice() else {
+        return Err("usage: read_time FILE REPEATS".into());
+    };
+    let mut times_ms = Vec::new();
+    let mut counts = (0, 0);
+    for _ in 0..repeats.parse::<u32>()? {
+        let begin = Instant::now();
+        let grids = read_all_grids(path)?;
+        times_ms.push(begin.elapsed().as_secs_f64() * 1e3);
+        if times_ms.len() == 1 {
+            counts =
+                (grids.len(), grids.iter().map(|grid| grid.tree.statistics().active_voxels).sum::<u64>());
+        }
+    }
+    times_ms.sort_by(f64::total_cmp);
+    let (Some(median), Some(min)) = (median(&times_ms), times_ms.first()) else {
+        return Err("REPEATS must be at least 1".into());
+    };
+    println!("median_ms={median:.3} min_ms={min:.3} grids={} active_voxels={}", counts.0, counts.1);
+    Ok(())
+}
