@@ -4,13 +4,19 @@
 //! A subcommand takes its arguments and returns; it never ends the process itself. What it computes lives in
 //! the libraries, what it prints in modules of its own.
 
+mod demo;
 mod error;
 mod grid;
 mod info;
 mod json;
+mod look;
 mod probe;
+mod progress;
+mod render;
+mod shot;
 mod source;
 mod text;
+mod values;
 
 use std::process::ExitCode;
 
@@ -33,12 +39,16 @@ struct Cli {
 enum Command {
     Info(info::Args),
     Probe(probe::Args),
+    Render(Box<render::Args>),
+    Demo(demo::Args),
 }
 
 fn main() -> ExitCode {
     let outcome = match Cli::parse().command {
         Command::Info(args) => info::run(&args),
         Command::Probe(args) => probe::run(&args),
+        Command::Render(args) => render::run(&args),
+        Command::Demo(args) => demo::run(&args),
     };
     match outcome {
         Ok(()) => ExitCode::SUCCESS,

@@ -4,12 +4,15 @@
 use glam::{DVec2, DVec3, Vec3};
 use nuage_volume::channel::{Channel, IndexBox};
 
-use crate::camera::Camera;
-use crate::march::{Marcher, Quality};
-use crate::scene::{Medium, Scene};
+use crate::camera::{Camera, Ray};
+use crate::color::luminance;
+use crate::march::{Marcher, Quality, Worker};
+use crate::scene::{Emission, Medium, Scene};
 
 /// The optical depth that the denser rays through a volume shall have.
 const TARGET_DEPTH: f32 = 8.0;
+/// The luminance that the brighter rays through something that glows shall have: white in a picture.
+const TARGET_LUMINANCE: f32 = 1.0;
 /// Rays per side of the grid that probes the volume.
 const PROBES: u32 = 32;
 /// Room around the volume in the picture.
@@ -88,25 +91,52 @@ pub fn fit_camera(
 }
 
 /// A density scale that shows the volume: one at which the denser rays of a view have an optical depth
-/// around eight. 1 if no ray meets anything.
-pub fn fit_density_scale(density: &Channel, camera: &Camera, aspect: f64) -> f32 {
+/// around eight. `None` if no ray meets anything.
+pub fn fit_density_scale(density: &Channel, camera: &Camera, aspect: f64) -> Option<f32> {
     let medium = Medium { density, density_scale: 1.0, albedo: [0.0; 3], phase_g: 0.0, emission: None };
+    let depth =
+        dense_value(medium, camera, aspect, |marcher, worker, ray| marcher.depth_per_scale(worker, ray));
+    valid_scale(TARGET_DEPTH / depth?)
+}
+
+/// How many times brighter an emission has to be so that the brighter rays of a view have a luminance around
+/// [`TARGET_LUMINANCE`]. `None` if no ray meets anything that glows.
+pub fn fit_emission_scale(emission: &Emission<'_>, camera: &Camera, aspect: f64) -> Option<f32> {
+    // The glowing channel stands in for the density, of which nothing is seen.
+    let density = emission.channel;
+    let emission = Some(emission.clone());
+    let medium = Medium { density, density_scale: 0.0, albedo: [0.0; 3], phase_g: 0.0, emission };
+    let luminance = dense_value(medium, camera, aspect, |marcher, worker, ray| {
+        luminance(marcher.radiance(worker, ray, 0).scattered.to_array())
+    });
+    valid_scale(TARGET_LUMINANCE / luminance?)
+}
+
+/// The value that nine of ten rays of a view that see anything stay below.
+fn dense_value(
+    medium: Medium<'_>,
+    camera: &Camera,
+    aspect: f64,
+    value: impl for<'m> Fn(&Marcher<'m>, &mut Worker<'m>, &Ray) -> f32,
+) -> Option<f32> {
     let scene = Scene { camera: *camera, medium, sun: None, sky: [0.0; 3] };
     let quality = Quality { step_voxels: 1.0, ..Quality::default() };
     let marcher = Marcher::new(&scene, quality);
     let mut worker = marcher.worker();
-    let height = ((f64::from(PROBES) / aspect).round() as u32).max(1);
-    let mut depths: Vec<f32> = (0..PROBES * height)
+    let height = ((f64::from(PROBES) / aspect).round() as u32).clamp(1, 64 * PROBES);
+    let mut values: Vec<f32> = (0..PROBES * height)
         .map(|i| {
             let pixel = DVec2::new(f64::from(i % PROBES) + 0.5, f64::from(i / PROBES) + 0.5);
-            marcher.depth_per_scale(&mut worker, &camera.ray(pixel, PROBES, height))
+            value(&marcher, &mut worker, &camera.ray(pixel, PROBES, height))
         })
-        .filter(|depth| *depth > 0.0)
+        .filter(|value| *value > 0.0)
         .collect();
-    depths.sort_by(f32::total_cmp);
-    let dense = depths.get(depths.len() * 9 / 10).copied().unwrap_or(0.0);
-    let scale = TARGET_DEPTH / dense;
-    if scale.is_finite() && scale > 0.0 { scale } else { 1.0 }
+    values.sort_by(f32::total_cmp);
+    values.get(values.len() * 9 / 10).copied()
+}
+
+fn valid_scale(scale: f32) -> Option<f32> {
+    (scale.is_finite() && scale > 0.0).then_some(scale)
 }
 
 /// The direction with an azimuth and an elevation in degrees, around an up axis: azimuth 0 is +z with y up and

@@ -7,9 +7,10 @@
 //! "Physically Based and Unified Volumetric Rendering in Frostbite", 2015). Homogeneous runs are integrated in
 //! closed form.
 //!
-//! The sun's share takes a shadow ray per step. The sky's takes a fixed number of shadow rays per camera ray,
-//! placed so that each stands for the same share of the scattered light, in directions drawn from the phase
-//! function: the mean is right, and the cost does not grow with the number of steps.
+//! Shadow rays cost the most, and most steps scatter too little to deserve one. Steps are therefore lit in
+//! groups that scatter about the same share of the light: the sun's transmittance is taken at the group's
+//! centre of scattering, which leaves an error of second order in its length. The sky's rays stand for equal
+//! shares too, in directions drawn from the phase function, so that their mean is right however few they are.
 //!
 //! What does not live here: pixels, threads, pictures ([`crate::picture`]).
 
@@ -24,13 +25,19 @@ use crate::scene::{Emission, Scene};
 use crate::traverse::{Field, LocalRay, Run, RunKind, Runs};
 
 /// A camera ray ends where less of the light behind passes than this.
-const MIN_TRANSMITTANCE: f32 = 1e-4;
+const MIN_TRANSMITTANCE: f32 = 2e-4;
 /// A shadow ray ends where its optical depth is more than this: less than 1.3e-4 of the light passes.
 const MAX_SHADOW_DEPTH: f32 = 9.0;
-/// In a homogeneous run the light is looked up again after this optical depth, …
+/// A lit homogeneous run is cut after this optical depth, …
 const LIT_PIECE_DEPTH: f32 = 0.25;
 /// … or after this many voxels, whichever is shorter.
 const LIT_PIECE_VOXELS: f32 = 8.0;
+/// A group of steps that share a ray to the sun is no longer than this, …
+const GROUP_VOXELS: f32 = 4.0;
+/// … unless it scatters less than this part of a full group; then …
+const FAINT_GROUP: f32 = 0.1;
+/// … this is its end.
+const FAINT_GROUP_VOXELS: f32 = 16.0;
 
 /// How finely a picture is computed.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -39,7 +46,10 @@ pub struct Quality {
     pub step_voxels: f32,
     /// The length of a step of a shadow ray, in voxels.
     pub shadow_step_voxels: f32,
-    /// Shadow rays towards the sky per camera ray.
+    /// Shadow rays towards the sun for a camera ray all of whose light is scattered; more where the medium is
+    /// thin and long. Without bound: one per step.
+    pub sun_rays: u32,
+    /// Shadow rays towards the sky for such a camera ray.
     pub sky_rays: u32,
     /// Camera rays per pixel.
     pub samples: u32,
@@ -47,7 +57,7 @@ pub struct Quality {
 
 impl Default for Quality {
     fn default() -> Self {
-        Quality { step_voxels: 0.5, shadow_step_voxels: 1.0, sky_rays: 8, samples: 4 }
+        Quality { step_voxels: 0.5, shadow_step_voxels: 1.0, sun_rays: 24, sky_rays: 8, samples: 1 }
     }
 }
 
@@ -82,8 +92,13 @@ struct Lighting<'m, 's> {
     density: &'m Field<'s>,
     /// The camera ray's direction in world space.
     view: Vec3,
+    /// The camera ray in the field's positions.
+    ray: LocalRay,
     /// The sun: its irradiance times albedo times phase function, and its direction in the field's positions.
     sun: Option<(Vec3, Vec3)>,
+    group: Group,
+    /// A group's longest extent in t, and a faint group's.
+    group_lengths: [f32; 2],
     /// The sky's radiance times albedo.
     sky: Option<Vec3>,
     /// The share of scattered light at which the next ray goes to the sky.
@@ -92,6 +107,15 @@ struct Lighting<'m, 's> {
     scattered: f32,
     sky_index: u32,
     random: u32,
+}
+
+/// Steps that are lit together: what they scatter of the camera's light, the same times t, and where they
+/// begin.
+#[derive(Debug, Clone, Copy, Default)]
+struct Group {
+    share: f32,
+    moment: f32,
+    start: f32,
 }
 
 impl<'s> Marcher<'s> {
@@ -137,7 +161,8 @@ impl<'s> Marcher<'s> {
         let voxels_per_length = voxels_per_length[0].max(voxels_per_length[1]);
         let lattice =
             Lattice { step: self.quality.step_voxels / voxels_per_length, shift: unit_f32(hash_u32(random)) };
-        let mut lighting = density.as_ref().map(|(field, ..)| Lighting::new(self, field, ray, random));
+        let mut lighting =
+            density.as_ref().map(|(field, local, _)| Lighting::new(self, field, ray, *local, random));
 
         // Two readers per channel: one finds the runs, the other samples them.
         let Worker { density: sampler, shadow, emission: glow } = worker;
@@ -183,10 +208,8 @@ impl<'s> Marcher<'s> {
                 }
                 let absorbed = one_minus_exp_neg(depth);
                 let share = result.transmittance * absorbed;
-                if let (Some(lighting), Some((_, local, _)), Some(shadow)) =
-                    (&mut lighting, &density, shadow.as_mut())
-                {
-                    result.scattered += lighting.scattered(shadow, local.at(t), share);
+                if let (Some(lighting), Some(shadow)) = (&mut lighting, shadow.as_mut()) {
+                    result.scattered += lighting.scattered(shadow, t0, t1, share);
                 }
                 // ∫ e^(−σt) dt over the step is absorbed / σ.
                 result.scattered += result.transmittance * (length * (absorbed / depth)) * emitted;
@@ -206,6 +229,9 @@ impl<'s> Marcher<'s> {
             if !goes_on {
                 break;
             }
+        }
+        if let (Some(lighting), Some(shadow)) = (&mut lighting, shadow.as_mut()) {
+            result.scattered += lighting.close_group(shadow);
         }
         result
     }
@@ -251,7 +277,13 @@ fn optical_depth<'s>(
 }
 
 impl<'m, 's> Lighting<'m, 's> {
-    fn new(marcher: &'m Marcher<'s>, density: &'m Field<'s>, ray: &Ray, random: u32) -> Self {
+    fn new(
+        marcher: &'m Marcher<'s>,
+        density: &'m Field<'s>,
+        ray: &Ray,
+        local: LocalRay,
+        random: u32,
+    ) -> Self {
         let medium = &marcher.scene.medium;
         let albedo = Vec3::from_array(medium.albedo);
         let view = ray.direction.as_vec3();
@@ -261,11 +293,15 @@ impl<'m, 's> Lighting<'m, 's> {
             (Vec3::from_array(sun.irradiance) * albedo * phase, density.directions() * sun.direction_to)
         });
         let rays = marcher.quality.sky_rays.max(1) as f32;
+        let voxels_per_length = local.direction.length();
         Lighting {
             marcher,
             density,
             view,
+            ray: local,
             sun: sun.filter(|(light, _)| *light != Vec3::ZERO),
+            group: Group::default(),
+            group_lengths: [GROUP_VOXELS / voxels_per_length, FAINT_GROUP_VOXELS / voxels_per_length],
             sky: marcher.sky.map(|sky| sky * albedo).filter(|light| *light != Vec3::ZERO),
             next_sky: unit_f32(hash_u32(random ^ 0x5bd1_e995)) / rays,
             scattered: 0.0,
@@ -278,11 +314,24 @@ impl<'m, 's> Lighting<'m, 's> {
         self.sun.is_some() || self.sky.is_some()
     }
 
-    /// The light scattered towards the camera at a position that accounts for `share` of the camera's light.
-    fn scattered(&mut self, shadow: &mut Accessor<'s>, position: Vec3, share: f32) -> Vec3 {
+    /// The light scattered towards the camera by a step that accounts for `share` of the camera's light, or by
+    /// a group of steps that ends with it.
+    #[inline]
+    fn scattered(&mut self, shadow: &mut Accessor<'s>, t0: f32, t1: f32, share: f32) -> Vec3 {
         let mut light = Vec3::ZERO;
-        if let Some((radiance, direction)) = self.sun {
-            light += radiance * share * self.transmittance(shadow, position, direction);
+        let t = 0.5 * (t0 + t1);
+        if self.sun.is_some() {
+            if self.group.share == 0.0 {
+                self.group.start = t0;
+            }
+            self.group.share += share;
+            self.group.moment += share * t;
+            // Of a full group, as one.
+            let part = self.group.share * self.marcher.quality.sun_rays as f32;
+            let longest = self.group_lengths[usize::from(part < FAINT_GROUP)];
+            if part >= 1.0 || t1 - self.group.start >= longest {
+                light += self.close_group(shadow);
+            }
         }
         if let Some(radiance) = self.sky {
             self.scattered += share;
@@ -290,10 +339,21 @@ impl<'m, 's> Lighting<'m, 's> {
             while self.scattered > self.next_sky {
                 self.next_sky += 1.0 / rays;
                 let direction = self.sky_direction();
-                light += radiance / rays * self.transmittance(shadow, position, direction);
+                light += radiance / rays * self.transmittance(shadow, self.ray.at(t), direction);
             }
         }
         light
+    }
+
+    /// The sun's light that the steps since the last call scatter towards the camera.
+    fn close_group(&mut self, shadow: &mut Accessor<'s>) -> Vec3 {
+        let Group { share, moment, .. } = std::mem::take(&mut self.group);
+        match self.sun {
+            Some((radiance, direction)) if share > 0.0 => {
+                radiance * share * self.transmittance(shadow, self.ray.at(moment / share), direction)
+            }
+            _ => Vec3::ZERO,
+        }
     }
 
     /// The next direction towards the sky, in the field's positions, drawn from the phase function.

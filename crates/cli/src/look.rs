@@ -1,0 +1,124 @@
+//! The options of `nuage render` that say how a volume looks: view, light, medium and quality.
+
+use glam::DVec3;
+
+use crate::values::{
+    Auto, Background, Size, SunPosition, albedo, field_of_view, finite, phase, positive, rgb, vec3,
+};
+
+/// View, light, medium and quality.
+#[derive(clap::Args, Clone)]
+pub(crate) struct Look {
+    /// Size of the picture in pixels, WIDTHxHEIGHT
+    #[arg(long, default_value = "1024x1024", value_name = "WxH", help_heading = "View")]
+    pub(crate) size: Size,
+
+    /// Position of the camera in world units, x,y,z [default: where all of the volume is seen]
+    #[arg(long, value_parser = vec3, allow_hyphen_values = true, value_name = "X,Y,Z", help_heading = "View")]
+    pub(crate) camera: Option<DVec3>,
+
+    /// World position in the middle of the picture, x,y,z [default: the middle of the volume]
+    #[arg(long, value_parser = vec3, allow_hyphen_values = true, value_name = "X,Y,Z", help_heading = "View")]
+    pub(crate) look_at: Option<DVec3>,
+
+    /// Which way is up: y (Houdini, Maya), z (Blender), or a direction x,y,z
+    #[arg(long, default_value = "y", value_parser = up, allow_hyphen_values = true, value_name = "AXIS", help_heading = "View")]
+    pub(crate) up: DVec3,
+
+    /// Horizontal field of view in degrees
+    #[arg(long, default_value = "35", value_parser = field_of_view, value_name = "DEGREES", help_heading = "View")]
+    pub(crate) fov: f64,
+
+    /// Where the sun stands: azimuth,elevation in degrees, or the direction TO the sun as x,y,z, or none
+    ///
+    /// Azimuth 0 is +z with y up and -y with z up (both towards the viewer of the default view) and turns
+    /// towards +x; elevation is positive above the horizon.
+    #[arg(
+        long,
+        default_value = "-60,40",
+        allow_hyphen_values = true,
+        value_name = "AZ,EL|X,Y,Z|none",
+        help_heading = "Light"
+    )]
+    pub(crate) sun: SunPosition,
+
+    /// Irradiance of the sun on a surface that faces it, one number or r,g,b (linear Rec.709)
+    #[arg(long, default_value = "12,11.2,10", value_parser = rgb, value_name = "E|R,G,B", help_heading = "Light")]
+    pub(crate) sun_irradiance: [f32; 3],
+
+    /// Radiance of the sky, the same from everywhere, one number or r,g,b (linear Rec.709)
+    #[arg(long, default_value = "0.22,0.32,0.5", value_parser = rgb, value_name = "L|R,G,B", help_heading = "Light")]
+    pub(crate) sky: [f32; 3],
+
+    /// What stands behind the volume: sky, a radiance (one number or r,g,b), or none to keep the alpha channel
+    #[arg(long, default_value = "sky", value_name = "sky|R,G,B|none", help_heading = "Light")]
+    pub(crate) background: Background,
+
+    /// Exposure in stops: every stop doubles all light in the picture
+    #[arg(long, default_value = "0", value_parser = finite, allow_hyphen_values = true, value_name = "STOPS", help_heading = "Light")]
+    pub(crate) exposure: f32,
+
+    /// Extinction per density and world unit of length; auto gives the denser rays an optical depth of 8
+    #[arg(long, default_value = "auto", value_name = "SCALE|auto", help_heading = "Medium")]
+    pub(crate) density: Auto,
+
+    /// Share of extinction that is scattering, 0 to 1, one number or r,g,b
+    #[arg(long, default_value = "0.95", value_parser = albedo, value_name = "A|R,G,B", help_heading = "Medium")]
+    pub(crate) albedo: [f32; 3],
+
+    /// Mean cosine g of the Henyey-Greenstein phase function, -1 to 1; positive scatters forward
+    #[arg(long, default_value = "0.2", value_parser = phase, allow_hyphen_values = true, value_name = "G", help_heading = "Medium")]
+    pub(crate) phase: f32,
+
+    /// Grid of temperatures that glows as a black body (see --kelvin)
+    #[arg(long, value_name = "GRID", conflicts_with = "flame", help_heading = "Emission")]
+    pub(crate) temperature: Option<String>,
+
+    /// Kelvin per unit of the temperature grid; Blender writes 0 to 3, for which 800 is a start
+    #[arg(long, default_value = "800", value_parser = positive, value_name = "K", help_heading = "Emission")]
+    pub(crate) kelvin: f32,
+
+    /// Grid whose value times --flame-color is radiance
+    #[arg(long, value_name = "GRID", help_heading = "Emission")]
+    pub(crate) flame: Option<String>,
+
+    /// Colour of the flame, one number or r,g,b (linear Rec.709)
+    #[arg(long, default_value = "1,0.32,0.06", value_parser = rgb, value_name = "R,G,B", help_heading = "Emission")]
+    pub(crate) flame_color: [f32; 3],
+
+    /// Radiance per world unit of length: of a black body at 1500 K, or of a flame of value 1; auto makes the
+    /// brighter rays white
+    #[arg(long, default_value = "auto", value_name = "SCALE|auto", help_heading = "Emission")]
+    pub(crate) emission: Auto,
+
+    /// Length of a step of a camera ray in voxels; halving it quarters the error
+    #[arg(long, default_value = "0.5", value_parser = positive, value_name = "VOXELS", help_heading = "Quality")]
+    pub(crate) step: f32,
+
+    /// Length of a step of a shadow ray in voxels
+    #[arg(long, default_value = "1", value_parser = positive, value_name = "VOXELS", help_heading = "Quality")]
+    pub(crate) shadow_step: f32,
+
+    /// Camera rays per pixel
+    #[arg(long, default_value = "4", value_parser = clap::value_parser!(u32).range(1..=65536), value_name = "N", help_heading = "Quality")]
+    pub(crate) samples: u32,
+
+    /// Shadow rays towards the sun per camera ray that is scattered whole; a large number means one per step
+    #[arg(long, default_value = "24", value_parser = clap::value_parser!(u32).range(1..=1_000_000), value_name = "N", help_heading = "Quality")]
+    pub(crate) sun_rays: u32,
+
+    /// Shadow rays towards the sky per camera ray that is scattered whole
+    #[arg(long, default_value = "8", value_parser = clap::value_parser!(u32).range(1..=65536), value_name = "N", help_heading = "Quality")]
+    pub(crate) sky_rays: u32,
+}
+
+fn up(text: &str) -> Result<DVec3, String> {
+    match text {
+        "y" | "Y" => Ok(DVec3::Y),
+        "z" | "Z" => Ok(DVec3::Z),
+        _ => vec3(text)
+            .map_err(|e| format!("y, z or a direction is needed: {e}"))?
+            .try_normalize()
+            .ok_or_else(|| "a direction other than 0,0,0 is needed".into()),
+    }
+}
