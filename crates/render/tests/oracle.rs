@@ -122,9 +122,9 @@ fn optical_depth_follows_the_quadrature() {
         let depths: Vec<f64> = pixel_centres(&camera)
             .map(|ray| 8.0 * f64::from(marcher.depth_per_scale(&mut worker, &ray)))
             .collect();
-        Errors::of(&depths, &exact)
+        Errors::of(&depths, &exact).over(largest)
     });
-    assert_second_order("optical depth", &errors, 1e-2, 1e-3);
+    assert_second_order("optical depth as a share of the largest", &errors, 1e-3, 1e-3);
 }
 
 #[test]
@@ -205,28 +205,32 @@ fn single_scattering_follows_another_renderer() {
     let expected: Vec<f64> = blocks(&reference, &|v| v / 64.0);
     let block_stderr: Vec<f64> = blocks(&stderr, &|v| v * v).into_iter().map(|v| v.sqrt() / 64.0).collect();
 
-    let quality = Quality::default();
-    let begin = Instant::now();
-    let image = render(&scene, quality, SIZE, SIZE, &|_, _| {}).expect("a picture").over(scene.sky);
-    println!("single scattering at {quality:?}: {:.2} s", begin.elapsed().as_secs_f64());
-    let values: Vec<f64> = image.pixels.iter().flat_map(|p| [p[0], p[1], p[2]]).map(f64::from).collect();
-    for channel in 0..3 {
-        let (ours, theirs) = (mean_of(&values, channel), mean_of(&reference, channel));
-        println!("  mean {ours:.5} instead of {theirs:.5}: {:+.3} %", 100.0 * (ours / theirs - 1.0));
-        assert!((ours / theirs - 1.0).abs() < 0.01);
+    // The second with so many samples that what remains of noise is small.
+    let fine = Quality { samples: 8, ..Quality::default() };
+    for (quality, limit_mean, limit_rms) in [(Quality::default(), 0.01, 0.01), (fine, 0.002, 0.005)] {
+        let begin = Instant::now();
+        let image = render(&scene, quality, SIZE, SIZE, &|_, _| {}).expect("a picture").over(scene.sky);
+        println!("single scattering at {quality:?}: {:.2} s", begin.elapsed().as_secs_f64());
+        let values: Vec<f64> = image.pixels.iter().flat_map(|p| [p[0], p[1], p[2]]).map(f64::from).collect();
+        for channel in 0..3 {
+            let (ours, theirs) = (mean_of(&values, channel), mean_of(&reference, channel));
+            println!("  mean {ours:.5} instead of {theirs:.5}: {:+.3} %", 100.0 * (ours / theirs - 1.0));
+            assert!((ours / theirs - 1.0).abs() < limit_mean);
+        }
+        let ours = blocks(&values, &|v| v / 64.0);
+        let relative: Vec<f64> = ours.iter().zip(&expected).map(|(a, b)| a / b - 1.0).collect();
+        let good = |((r, e), s): &((&f64, &f64), &f64)| r.abs() < 0.03 || r.abs() * **e < 3.0 * **s;
+        let count = relative.iter().zip(&expected).zip(&block_stderr).filter(good).count();
+        let share = count as f64 / relative.len() as f64;
+        let rms = (relative.iter().map(|r| r * r).sum::<f64>() / relative.len() as f64).sqrt();
+        let worst = relative.iter().fold(0.0f64, |worst, r| worst.max(r.abs()));
+        let percent = [rms, worst, share].map(|v| 100.0 * v);
+        println!(
+            "  8×8 blocks in %: RMS error {:.3}, worst {:.3}, good {:.2}",
+            percent[0], percent[1], percent[2]
+        );
+        assert!(share >= 0.99 && rms < limit_rms, "{share} of the blocks are good, RMS error {rms}");
     }
-    let ours = blocks(&values, &|v| v / 64.0);
-    let relative: Vec<f64> = ours.iter().zip(&expected).map(|(a, b)| a / b - 1.0).collect();
-    let good = relative
-        .iter()
-        .zip(&expected)
-        .zip(&block_stderr)
-        .filter(|((r, e), s)| r.abs() < 0.03 || r.abs() * *e < 3.0 * *s);
-    let share = good.count() as f64 / relative.len() as f64;
-    let rms = (relative.iter().map(|r| r * r).sum::<f64>() / relative.len() as f64).sqrt();
-    let worst = relative.iter().fold(0.0f64, |worst, r| worst.max(r.abs()));
-    println!("  blocks: RMS {:.3} %, worst {:.3} %, {:.2} % good", 100.0 * rms, 100.0 * worst, 100.0 * share);
-    assert!(share >= 0.99, "{share} of the blocks are good");
 }
 
 /// Single scattering along a ray by quadrature in double precision: the light of the sun and that of a sky of
@@ -287,13 +291,8 @@ fn brute_force(dense: &Dense, ray: &Ray, sigma: f64, g: f64, to_sun: DVec3) -> [
 fn phase_function_and_lights_agree_with_brute_force() {
     let (json, density) = (json(), channel("density"));
     let dense = Dense::new(&density);
-    let quality = Quality {
-        sky_rays: 512,
-        sun_rays: u32::MAX,
-        step_voxels: 0.5,
-        shadow_step_voxels: 0.5,
-        samples: 1,
-    };
+    let quality =
+        Quality { sky_rays: 512, sun_rays: u32::MAX, step_voxels: 0.5, shadow_step_voxels: 0.5, samples: 1 };
     for g in [0.8f32, -0.5] {
         let full = lit_scene(&json, &density, g);
         for (x, y) in [(64.5, 64.5), (50.5, 80.5)] {
@@ -333,12 +332,8 @@ fn phase_function_and_lights_agree_with_brute_force() {
 fn sun_along_the_view_has_closed_forms() {
     let (json, density) = (json(), channel("density"));
     let dense = Dense::new(&density);
-    let quality = Quality {
-        step_voxels: 0.125,
-        shadow_step_voxels: 0.25,
-        sun_rays: u32::MAX,
-        ..Quality::default()
-    };
+    let quality =
+        Quality { step_voxels: 0.125, shadow_step_voxels: 0.25, sun_rays: u32::MAX, ..Quality::default() };
     let mut checked = 0;
     for g in [0.0f32, 0.8, -0.5] {
         let mut scene = lit_scene(&json, &density, g);

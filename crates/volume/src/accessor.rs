@@ -126,18 +126,28 @@ impl<'a> Accessor<'a> {
         let last = |c: i32| usize::from(c == 7);
         // Which axes reach into the next brick; corner and brick number their bits `x << 2 | y << 1 | z`.
         let across = last(local.x) << 2 | last(local.y) << 1 | last(local.z);
-        let step = |i: usize| IVec3::new((i >> 2 & 1) as i32, (i >> 1 & 1) as i32, (i & 1) as i32);
         let brick = brick_of(cell);
         let mut contents = [self.content(brick); 8];
-        for i in 1..8 {
+        for (i, content) in contents.iter_mut().enumerate().skip(1) {
             if i & !across == 0 {
-                contents[i] = self.region(brick.wrapping_add(step(i))).content;
+                let step = IVec3::new((i >> 2) as i32, (i >> 1 & 1) as i32, (i & 1) as i32);
+                *content = self.region(brick.wrapping_add(step)).content;
             }
         }
-        let corners = std::array::from_fn(|i| match contents[i & across] {
-            Content::Constant(value) => value,
-            Content::Brick(brick) => self.tree.bricks.value(brick, voxel_offset(cell.wrapping_add(step(i)))),
-        });
+        let next = (local + 1) & 7;
+        let offset = |i: usize| {
+            let x = if i & 4 == 0 { local.x } else { next.x };
+            let y = if i & 2 == 0 { local.y } else { next.y };
+            let z = if i & 1 == 0 { local.z } else { next.z };
+            (x << 6 | y << 3 | z) as usize
+        };
+        let mut corners = [0.0; 8];
+        for (i, corner) in corners.iter_mut().enumerate() {
+            *corner = match contents[i & across] {
+                Content::Constant(value) => value,
+                Content::Brick(brick) => self.tree.bricks.value(brick, offset(i)),
+            };
+        }
         lerp(corners, fraction)
     }
 }

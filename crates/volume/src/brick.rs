@@ -56,16 +56,17 @@ impl Bricks {
     #[inline]
     pub fn corners(&self, brick: u32, offset: usize) -> [f32; 8] {
         // Neighbours are 64, 8 and 1 apart, so the eight lie in 74 consecutive values: one bounds check.
-        const STEPS: [usize; 8] = [0, 1, 8, 9, 64, 65, 72, 73];
         let at = brick as usize * BRICK_VOXELS + offset;
         match self {
             Bricks::F32(values) => {
-                let values: &[f32; 74] = values[at..at + 74].try_into().expect("74 values");
-                STEPS.map(|step| values[step])
+                let v: &[f32; 74] = values[at..at + 74].try_into().expect("74 values");
+                [v[0], v[1], v[8], v[9], v[64], v[65], v[72], v[73]]
             }
             Bricks::F16(values) => {
-                let values: &[u16; 74] = values[at..at + 74].try_into().expect("74 values");
-                STEPS.map(|step| f32_from_finite_f16(values[step]))
+                let v: &[u16; 74] = values[at..at + 74].try_into().expect("74 values");
+                // Written out: `map` over the steps stays a call in a loop.
+                let f = f32_from_finite_f16;
+                [f(v[0]), f(v[1]), f(v[8]), f(v[9]), f(v[64]), f(v[65]), f(v[72]), f(v[73])]
             }
         }
     }
