@@ -116,8 +116,7 @@ pub fn import(grid: Grid) -> Result<(Channel, Report), ImportError> {
     let name = grid.info.unique_name.clone();
     let active_box = grid
         .tree
-        .statistics()
-        .active_bbox
+        .active_bbox()
         .map(|[min, max]| IndexBox { min: IVec3::from_array(min), max: IVec3::from_array(max) });
     let build_error = |source| ImportError::Build { grid: name.clone(), source };
     let Some(clip) = active_box else {
@@ -342,14 +341,18 @@ fn convert_leaf(
     if inside_min != IVec3::ZERO || inside_max != IVec3::splat(7) {
         clear_outside(values, inside_min, inside_max);
     }
-    let count = |test: fn(&f32) -> bool| values.iter().filter(|v| test(v)).count() as u16;
-    let nan = count(|v| v.is_nan());
-    let (negative, infinite) = match meaning {
-        Meaning::Density => (count(|v| *v < 0.0), count(|v| *v == f32::INFINITY)),
-        Meaning::LevelSet { .. } => (0, 0),
-    };
-    for value in values.iter_mut() {
-        *value = meaning.density(*value);
+    let (mut nan, mut negative, mut infinite) = (0, 0, 0);
+    // The bits of NaN, negative values and infinities are larger than those of densities; few leaves hold any.
+    let largest = values.iter().fold(0, |largest, v| v.to_bits().max(largest));
+    if largest > f32::MAX.to_bits() || matches!(meaning, Meaning::LevelSet { .. }) {
+        let count = |test: fn(&f32) -> bool| values.iter().filter(|v| test(v)).count() as u16;
+        nan = count(|v| v.is_nan());
+        if matches!(meaning, Meaning::Density) {
+            (negative, infinite) = (count(|v| *v < 0.0), count(|v| *v == f32::INFINITY));
+        }
+        for value in values.iter_mut() {
+            *value = meaning.density(*value);
+        }
     }
     let exact_in_half = may_be_half && {
         let mut halves = [f16::ZERO; BRICK_VOXELS];

@@ -22,7 +22,7 @@ use crate::hash::{hash_u32, unit_f32};
 use crate::math::{exp, one_minus_exp_neg};
 use crate::phase::{hg, sample_hg};
 use crate::scene::{Emission, Scene};
-use crate::traverse::{Field, LocalRay, Run, RunKind, Runs};
+use crate::traverse::{Field, LocalRay, Run, RunKind, Runs, floor};
 
 /// A camera ray ends where less of the light behind passes than this.
 const MIN_TRANSMITTANCE: f32 = 2e-4;
@@ -401,7 +401,7 @@ impl Lattice {
     fn steps(self, start: f32, end: f32, step: &mut impl FnMut(f32, f32) -> bool) -> bool {
         // A million steps at most, which single precision can still count.
         let length = self.step.max(end * 1e-6);
-        let mut k = (start / length - self.shift) as i32;
+        let mut k = floor(start / length - self.shift);
         let mut t0 = start;
         while t0 < end {
             k += 1;

@@ -127,8 +127,9 @@ impl<'a> Field<'a> {
     pub fn exit(&self, ray: &LocalRay) -> f32 {
         let far =
             Vec3::select(ray.direction.cmpge(Vec3::ZERO), self.bounds[1].as_vec3(), self.bounds[0].as_vec3());
-        // NaN arises on an axis along which nothing moves; min() passes over it.
         let t = (far - ray.origin) * ray.inverse;
+        // An axis along which nothing moves, be its zero negative, never comes first.
+        let t = Vec3::select(ray.direction.cmpeq(Vec3::ZERO), Vec3::INFINITY, t);
         f32::INFINITY.min(t.x).min(t.y).min(t.z)
     }
 
@@ -144,7 +145,7 @@ impl<'a> Field<'a> {
     pub fn runs<'r>(&self, accessor: &'r mut Accessor<'a>, ray: LocalRay, t0: f32, t1: f32) -> Runs<'r, 'a> {
         let position = (ray.origin + ray.direction * t0) * 0.125;
         let brick = IVec3::new(floor(position.x), floor(position.y), floor(position.z));
-        Runs {
+        let mut runs = Runs {
             accessor,
             ray,
             base_brick: self.base_brick,
@@ -152,9 +153,13 @@ impl<'a> Field<'a> {
             brick: brick.wrapping_add(self.base_brick).clamp(self.brick_box[0], self.brick_box[1]),
             t: t0,
             t_end: t1,
-            split: None,
+            t_next: Vec3::INFINITY,
+            t_brick: (8.0 * ray.inverse).abs(),
+            tile_parts: [None; 3],
             held: None,
-        }
+        };
+        runs.aim();
+        runs
     }
 }
 
@@ -186,7 +191,7 @@ impl LocalRay {
 
 /// The largest integer not above x. `f32::floor` is a library call without SSE 4.1.
 #[inline]
-fn floor(x: f32) -> i32 {
+pub(crate) fn floor(x: f32) -> i32 {
     let i = x as i32;
     i.saturating_sub(i32::from(x < i as f32))
 }
@@ -202,8 +207,11 @@ pub struct Runs<'r, 'a> {
     brick: IVec3,
     t: f32,
     t_end: f32,
-    /// What is left of a large tile: the homogeneous part and the layer behind it.
-    split: Option<[Run; 2]>,
+    /// Where the ray leaves that brick along each axis, and the distance between its faces.
+    t_next: Vec3,
+    t_brick: Vec3,
+    /// What is left of a large tile, last part first.
+    tile_parts: [Option<Run>; 3],
     /// A varying run that may go on.
     held: Option<Run>,
 }
@@ -211,80 +219,124 @@ pub struct Runs<'r, 'a> {
 impl Runs<'_, '_> {
     /// The next stretch that is not empty, one region at a time.
     fn next_stretch(&mut self) -> Option<Run> {
-        if let Some([first, second]) = self.split.take() {
-            if first.t0 < first.t1 {
-                self.split = Some([Run { t1: first.t0, ..first }, second]);
-                return Some(first);
-            }
-            if second.t0 < second.t1 {
-                return Some(second);
-            }
+        if let Some(run) = self.next_of_tile() {
+            return Some(run);
         }
         while self.t < self.t_end {
             let region = self.accessor.region(self.brick);
-            let extent = 1 << region.log2_bricks;
-            let origin = self.brick & !(extent - 1);
-            let low = (origin - self.base_brick).as_vec3() * 8.0;
-            let high = low + (extent * 8) as f32;
-            let t0 = self.t;
-            self.step(origin, extent, low, high);
+            let (t0, brick) = (self.t, self.brick);
+            if region.log2_bricks == 0 {
+                self.step_brick();
+            } else {
+                self.leap(region.log2_bricks);
+            }
             let t1 = self.t.min(self.t_end);
-            if t0 >= t1 {
-                continue;
-            }
             let bounds = region.footprint;
+            if t0 >= t1 || (bounds.max == 0.0 && bounds.min == 0.0) {
+                continue;
+            }
             if bounds.is_constant() {
-                if bounds.max != 0.0 {
-                    return Some(Run { t0, t1, kind: RunKind::Constant(bounds.max) });
+                return Some(Run { t0, t1, kind: RunKind::Constant(bounds.max) });
+            }
+            if region.log2_bricks > 0
+                && let Content::Constant(value) = region.content
+            {
+                self.split_tile(brick, region.log2_bricks, value, t0, t1);
+                if let Some(run) = self.next_of_tile() {
+                    return Some(run);
                 }
                 continue;
             }
-            match region.content {
-                Content::Constant(value) if extent > 1 => {
-                    let [a, b] = self.ray.box_interval(low, high - 1.0);
-                    // A ray that misses the homogeneous part has its whole stretch in the layer.
-                    let (a, b) = if a < b { (a.clamp(t0, t1), b.clamp(t0, t1)) } else { (t1, t1) };
-                    let layer = |t0, t1| Run { t0, t1, kind: RunKind::Varying };
-                    let middle = if value == 0.0 { b } else { a };
-                    let first = Run { t0: middle, t1: b, kind: RunKind::Constant(value) };
-                    self.split = Some([first, layer(b, t1)]);
-                    if t0 < a {
-                        return Some(layer(t0, a));
-                    }
-                    return self.next_stretch();
-                }
-                _ => return Some(Run { t0, t1, kind: RunKind::Varying }),
-            }
+            return Some(Run { t0, t1, kind: RunKind::Varying });
         }
         None
     }
 
-    /// Moves on to where the ray leaves a region, and to the brick behind.
+    /// Moves on to the next brick.
     #[inline]
-    fn step(&mut self, origin: IVec3, extent: i32, low: Vec3, high: Vec3) {
-        let forward = self.ray.direction.cmpge(Vec3::ZERO);
-        let t = (Vec3::select(forward, high, low) - self.ray.origin) * self.ray.inverse;
-        // An axis along which nothing moves never comes first.
-        let t = Vec3::select(self.ray.direction.cmpeq(Vec3::ZERO), Vec3::INFINITY, t);
-        let axis = if t.x <= t.y && t.x <= t.z {
+    fn step_brick(&mut self) {
+        let Vec3 { x, y, z } = self.t_next;
+        let axis = if x <= y && x <= z {
             0
-        } else if t.y <= t.z {
+        } else if y <= z {
             1
         } else {
             2
         };
-        self.t = self.t.max(t[axis]);
-        let position = self.ray.at(self.t) * 0.125;
-        let brick = IVec3::new(floor(position.x), floor(position.y), floor(position.z));
-        let last = origin + (extent - 1);
-        self.brick = brick.wrapping_add(self.base_brick).clamp(origin, last);
-        // The axis of the exit moves by the integers, so that the walk never stands still.
-        self.brick[axis] = if forward.test(axis) { last[axis] + 1 } else { origin[axis] - 1 };
-        let inside = self.brick.cmpge(self.brick_box[0]).all() && self.brick.cmple(self.brick_box[1]).all();
-        if !inside {
+        self.t = self.t.max(self.t_next[axis]);
+        self.t_next[axis] += self.t_brick[axis];
+        let forward = self.ray.direction[axis] >= 0.0;
+        self.brick[axis] += if forward { 1 } else { -1 };
+        let outside = if forward {
+            self.brick[axis] > self.brick_box[1][axis]
+        } else {
+            self.brick[axis] < self.brick_box[0][axis]
+        };
+        if outside {
             self.t_end = self.t_end.min(self.t);
         }
     }
+
+    /// Moves on to where the ray leaves a region of more than one brick, and to the brick behind.
+    fn leap(&mut self, log2_bricks: u32) {
+        let (origin, last) = extent(self.brick, log2_bricks);
+        let forward = self.ray.direction.cmpge(Vec3::ZERO);
+        let faces = IVec3::select(forward, last + 1, origin);
+        let t = self.faces_at(faces);
+        let axis = t.min_position();
+        self.t = self.t.max(t[axis]);
+        let position = self.ray.at(self.t) * 0.125;
+        let brick = IVec3::new(floor(position.x), floor(position.y), floor(position.z));
+        // Rounding may put an entry point just outside the box; only the axis of the exit may leave it.
+        let [box_first, box_last] = self.brick_box;
+        self.brick = brick.wrapping_add(self.base_brick).clamp(origin.max(box_first), last.min(box_last));
+        // The axis of the exit moves by the integers, so that the walk never stands still.
+        self.brick[axis] = if forward.test(axis) { last[axis] + 1 } else { origin[axis] - 1 };
+        let inside = self.brick.cmpge(box_first).all() && self.brick.cmple(box_last).all();
+        if !inside {
+            self.t_end = self.t_end.min(self.t);
+        }
+        self.aim();
+    }
+
+    /// Finds where the ray leaves the brick it is in.
+    fn aim(&mut self) {
+        let forward = self.ray.direction.cmpge(Vec3::ZERO);
+        self.t_next = self.faces_at(IVec3::select(forward, self.brick + 1, self.brick));
+    }
+
+    /// Where the ray crosses the low faces of a brick; never, along an axis along which nothing moves.
+    fn faces_at(&self, brick: IVec3) -> Vec3 {
+        let t = ((brick - self.base_brick).as_vec3() * 8.0 - self.ray.origin) * self.ray.inverse;
+        Vec3::select(self.ray.direction.cmpeq(Vec3::ZERO), Vec3::INFINITY, t)
+    }
+
+    /// The next part of a tile that was cut.
+    #[inline]
+    fn next_of_tile(&mut self) -> Option<Run> {
+        self.tile_parts.iter_mut().rev().find_map(Option::take)
+    }
+
+    /// Cuts the stretch of a large tile at its homogeneous part.
+    fn split_tile(&mut self, brick: IVec3, log2_bricks: u32, value: f32, t0: f32, t1: f32) {
+        let (origin, last) = extent(brick, log2_bricks);
+        let position = |brick: IVec3| (brick - self.base_brick).as_vec3() * 8.0;
+        let [a, b] = self.ray.box_interval(position(origin), position(last + 1) - 1.0);
+        // A ray that misses the homogeneous part has its whole stretch in the layer.
+        let (a, b) = if a < b { (a.clamp(t0, t1), b.clamp(t0, t1)) } else { (t1, t1) };
+        let layer = |t0, t1| Run { t0, t1, kind: RunKind::Varying };
+        let core = Run { t0: a, t1: b, kind: RunKind::Constant(value) };
+        let parts = [layer(b, t1), core, layer(t0, a)];
+        self.tile_parts =
+            parts.map(|run| (run.t0 < run.t1 && run.kind != RunKind::Constant(0.0)).then_some(run));
+    }
+}
+
+/// The first and last brick of the aligned cube around a brick.
+fn extent(brick: IVec3, log2_bricks: u32) -> (IVec3, IVec3) {
+    let bricks = 1 << log2_bricks;
+    let origin = brick & !(bricks - 1);
+    (origin, origin + (bricks - 1))
 }
 
 impl Iterator for Runs<'_, '_> {

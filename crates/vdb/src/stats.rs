@@ -69,6 +69,26 @@ impl Tree {
         }
     }
 
+    /// The box of all active voxels and tiles: that of [`Tree::statistics`], without looking at values.
+    pub fn active_bbox(&self) -> Option<IndexBox> {
+        let mut bbox = None;
+        let mut cube = |origin: [i32; 3], log2_voxels: u32| {
+            grow(&mut bbox, origin, origin.map(|c| c.wrapping_add((1 << log2_voxels) - 1)));
+        };
+        self.root_tiles.iter().filter(|tile| tile.active).for_each(|tile| cube(tile.origin, 12));
+        for (nodes, level) in [(&self.nodes5, LEVEL5), (&self.nodes4, LEVEL4)] {
+            for node in nodes {
+                for slot in node.value_mask.iter().filter(|slot| !node.child_mask.contains(*slot)) {
+                    cube(level.child_origin(node.origin, slot), level.log2_child_voxels);
+                }
+            }
+        }
+        for (origin, mask) in self.leaves.origins.iter().zip(&self.leaves.masks) {
+            grow_to_leaf(&mut bbox, *origin, mask);
+        }
+        bbox
+    }
+
     /// FNV-1a hash over origin (three little-endian i32) and mask (64 bytes) of every leaf, in leaf order.
     pub fn topology_hash(&self) -> u64 {
         let mut hash = Fnv1a::default();
@@ -147,22 +167,25 @@ impl Seen {
     }
 
     fn leaf(&mut self, origin: [i32; 3], mask: &[u64; 8], values: &[f32; LEAF_VOXELS]) {
-        let (mut min, mut max) = ([7, 7, 7], [-1, -1, -1]);
-        for (x, word) in mask.iter().enumerate().filter(|(_, word)| **word != 0) {
-            // One word is a slab of constant x; its bytes are rows of constant y.
-            let rows = (0..8).filter(|y| word >> (8 * y) & 0xff != 0);
-            let columns = word.to_le_bytes().iter().fold(0u8, |all, row| all | row);
-            let z = [columns.trailing_zeros() as i32, 7 - columns.leading_zeros() as i32];
-            let y = [rows.clone().min().unwrap_or(7), rows.max().unwrap_or(0)];
-            for (axis, [low, high]) in [[x as i32; 2], y, z].into_iter().enumerate() {
-                min[axis] = min[axis].min(low);
-                max[axis] = max[axis].max(high);
-            }
+        for (x, word) in mask.iter().enumerate() {
             bits(*word).for_each(|bit| self.value(values[x * 64 + bit]));
         }
-        if max[0] >= 0 {
-            let at = |local: [i32; 3]| std::array::from_fn(|i| origin[i].wrapping_add(local[i]));
-            grow(&mut self.bbox, at(min), at(max));
-        }
+        grow_to_leaf(&mut self.bbox, origin, mask);
     }
+}
+
+/// Takes in the active voxels of a leaf.
+fn grow_to_leaf(bbox: &mut Option<IndexBox>, origin: [i32; 3], mask: &[u64; 8]) {
+    // One word is a slab of constant x; its bytes are rows of constant y.
+    let slab = mask.iter().fold(0, |all, word| all | word);
+    if slab == 0 {
+        return;
+    }
+    let x = (0..8).filter(|x| mask[*x as usize] != 0);
+    let y = (0..8).filter(|y| slab >> (8 * y) & 0xff != 0);
+    let columns = slab.to_le_bytes().iter().fold(0u8, |all, row| all | row);
+    let min = [x.clone().min().unwrap_or(0), y.clone().min().unwrap_or(0), columns.trailing_zeros() as i32];
+    let max = [x.max().unwrap_or(7), y.max().unwrap_or(7), 7 - columns.leading_zeros() as i32];
+    let at = |local: [i32; 3]| std::array::from_fn(|i| origin[i].wrapping_add(local[i]));
+    grow(bbox, at(min), at(max));
 }

@@ -119,43 +119,61 @@ impl<'a> Accessor<'a> {
         }
     }
 
-    /// The same where the cell's corners lie in two, four or eight bricks.
-    #[inline(never)]
+    /// The same where the cell reaches into other bricks.
     fn trilinear_across_bricks(&mut self, cell: IVec3, fraction: Vec3) -> f32 {
         let local = cell & 7;
-        let last = |c: i32| usize::from(c == 7);
-        // Which axes reach into the next brick; corner and brick number their bits `x << 2 | y << 1 | z`.
-        let across = last(local.x) << 2 | last(local.y) << 1 | last(local.z);
+        let offset = voxel_offset(cell);
+        let [fx, fy, fz] = fraction.to_array();
+        match (local.x == 7, local.y == 7, local.z == 7) {
+            (true, false, false) => self.across_face(cell, offset, IVec3::X, 64, (8, 1), (fx, fy, fz)),
+            (false, true, false) => self.across_face(cell, offset, IVec3::Y, 8, (64, 1), (fy, fx, fz)),
+            (false, false, true) => self.across_face(cell, offset, IVec3::Z, 1, (64, 8), (fz, fx, fy)),
+            _ => self.across_edge(cell, fraction),
+        }
+    }
+
+    /// Two bricks: bilinear in each, then linear along the axis between them. Most cells at a border are
+    /// of this kind. `across` is the offset's step along that axis, `steps` and `f` those of the other two.
+    #[inline]
+    fn across_face(
+        &mut self,
+        cell: IVec3,
+        offset: usize,
+        axis: IVec3,
+        across: usize,
+        steps: (usize, usize),
+        (f, fa, fb): (f32, f32, f32),
+    ) -> f32 {
         let brick = brick_of(cell);
-        let mut contents = [self.content(brick); 8];
-        for (i, content) in contents.iter_mut().enumerate().skip(1) {
-            if i & !across == 0 {
-                let step = IVec3::new((i >> 2) as i32, (i >> 1 & 1) as i32, (i & 1) as i32);
-                *content = self.region(brick.wrapping_add(step)).content;
+        let here = self.content(brick);
+        let next = self.region(brick.wrapping_add(axis)).content;
+        let bricks = &self.tree.bricks;
+        let bilinear = |content: Content, offset: usize| match content {
+            Content::Constant(value) => value,
+            Content::Brick(brick) => {
+                let [v00, v01, v10, v11] = bricks.quad(brick, offset, steps.0, steps.1);
+                mix(mix(v00, v01, fb), mix(v10, v11, fb), fa)
             }
-        }
-        let next = (local + 1) & 7;
-        let offset = |i: usize| {
-            let x = if i & 4 == 0 { local.x } else { next.x };
-            let y = if i & 2 == 0 { local.y } else { next.y };
-            let z = if i & 1 == 0 { local.z } else { next.z };
-            (x << 6 | y << 3 | z) as usize
         };
-        let mut corners = [0.0; 8];
-        for (i, corner) in corners.iter_mut().enumerate() {
-            *corner = match contents[i & across] {
-                Content::Constant(value) => value,
-                Content::Brick(brick) => self.tree.bricks.value(brick, offset(i)),
-            };
-        }
-        lerp(corners, fraction)
+        mix(bilinear(here, offset), bilinear(next, offset - 7 * across), f)
+    }
+
+    /// Four or eight bricks.
+    #[inline(never)]
+    fn across_edge(&mut self, cell: IVec3, fraction: Vec3) -> f32 {
+        let corner = |i: i32| cell.wrapping_add(IVec3::new(i >> 2, i >> 1 & 1, i & 1));
+        lerp([0, 1, 2, 3, 4, 5, 6, 7].map(|i| self.voxel(corner(i))), fraction)
     }
 }
 
 /// The trilinear interpolation of eight corners, corner `i` at `dx << 2 | dy << 1 | dz`.
 #[inline]
 fn lerp(c: [f32; 8], f: Vec3) -> f32 {
-    let mix = |a: f32, b: f32, t: f32| a + (b - a) * t;
     let z = [mix(c[0], c[1], f.z), mix(c[2], c[3], f.z), mix(c[4], c[5], f.z), mix(c[6], c[7], f.z)];
     mix(mix(z[0], z[1], f.y), mix(z[2], z[3], f.y), f.x)
+}
+
+#[inline]
+fn mix(a: f32, b: f32, t: f32) -> f32 {
+    a + (b - a) * t
 }

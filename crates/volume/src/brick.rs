@@ -1,8 +1,6 @@
 //! Bricks: the voxel values of 8³ voxels each, in one flat array, as f32 or as f16.
 
-use glam::IVec3;
-
-use crate::space::{BRICK_VOXELS, voxel_offset};
+use crate::space::BRICK_VOXELS;
 
 /// The values of all bricks of a tree, [`BRICK_VOXELS`] each, voxel offset `x << 6 | y << 3 | z`.
 #[derive(Debug, Clone, PartialEq)]
@@ -70,6 +68,27 @@ impl Bricks {
             }
         }
     }
+
+    /// The values at an offset and one step along each of two axes: `[00, 01, 10, 11]`, the first digit for
+    /// `step_a`. The steps are 64, 8 or 1, for x, y and z.
+    ///
+    /// # Panics
+    /// If there is no such brick, or the offsets leave it.
+    #[inline]
+    pub fn quad(&self, brick: u32, offset: usize, step_a: usize, step_b: usize) -> [f32; 4] {
+        let at = brick as usize * BRICK_VOXELS;
+        match self {
+            Bricks::F32(values) => {
+                let v: &[f32; BRICK_VOXELS] = values[at..at + BRICK_VOXELS].try_into().expect("512 values");
+                [v[offset], v[offset + step_b], v[offset + step_a], v[offset + step_a + step_b]]
+            }
+            Bricks::F16(values) => {
+                let v: &[u16; BRICK_VOXELS] = values[at..at + BRICK_VOXELS].try_into().expect("512 values");
+                let f = |offset: usize| f32_from_finite_f16(v[offset]);
+                [f(offset), f(offset + step_b), f(offset + step_a), f(offset + step_a + step_b)]
+            }
+        }
+    }
 }
 
 /// The value of a finite f16. Exact: the exponent is moved by a multiplication with a power of two, which also
@@ -122,31 +141,28 @@ pub struct BrickSummary {
 impl BrickSummary {
     /// Summarises the values of a brick. They must be finite.
     pub fn of(values: &[f32; BRICK_VOXELS]) -> Self {
-        let mut low_bounds = [Bounds { min: f32::INFINITY, max: f32::NEG_INFINITY }; 8];
-        let bounds_of = |values: &[f32]| {
-            let start = Bounds { min: f32::INFINITY, max: f32::NEG_INFINITY };
-            values.iter().fold(start, |b, v| Bounds {
-                min: if *v < b.min { *v } else { b.min },
-                max: if *v > b.max { *v } else { b.max },
-            })
-        };
-        for x in 0..8 {
-            for y in 0..8 {
-                let row_start = voxel_offset(IVec3::new(x, y, 0));
-                let row = bounds_of(&values[row_start..row_start + 8]);
-                let first = Bounds::of(values[row_start]);
-                for axes in 0..4 {
-                    let (low_x, low_y) = (axes & 2 != 0, axes & 1 != 0);
-                    if (low_x && x != 0) || (low_y && y != 0) {
-                        continue;
-                    }
-                    low_bounds[axes * 2] = low_bounds[axes * 2].union(row);
-                    low_bounds[axes * 2 + 1] = low_bounds[axes * 2 + 1].union(first);
-                }
+        // Bounds of the columns of constant z over rows: all, those of y = 0, of x = 0, of x = y = 0.
+        let (mut min, mut max) = ([[f32::INFINITY; 8]; 4], [[f32::NEG_INFINITY; 8]; 4]);
+        let mut take = |axes: usize, row: &[f32]| {
+            for z in 0..8 {
+                min[axes][z] = if row[z] < min[axes][z] { row[z] } else { min[axes][z] };
+                max[axes][z] = if row[z] > max[axes][z] { row[z] } else { max[axes][z] };
             }
-        }
+        };
+        let (rows, _) = values.as_chunks::<8>();
+        rows.iter().for_each(|row| take(0, row));
+        rows.iter().step_by(8).for_each(|row| take(1, row));
+        rows[..8].iter().for_each(|row| take(2, row));
+        take(3, &rows[0]);
+        let low_bounds = std::array::from_fn(|axes| {
+            let columns = if axes & 1 == 0 { 0..8 } else { 0..1 };
+            let of = |z: usize| Bounds { min: min[axes / 2][z], max: max[axes / 2][z] };
+            columns.map(of).fold(Bounds { min: f32::INFINITY, max: f32::NEG_INFINITY }, Bounds::union)
+        });
         // Summed in f64: 512 values near f32::MAX would overflow.
-        let sum: f64 = values.iter().map(|v| f64::from(*v)).sum();
+        let mut sums = [0.0; 8];
+        rows.iter().for_each(|row| (0..8).for_each(|z| sums[z] += f64::from(row[z])));
+        let sum: f64 = sums.iter().sum();
         BrickSummary { low_bounds, mean: (sum / BRICK_VOXELS as f64) as f32 }
     }
 }
