@@ -1,5 +1,6 @@
 //! Which grid of a file the user means. Shared by all subcommands with a `--grid` option.
 
+use nuage_pipeline::select;
 use nuage_vdb::{File, Source};
 
 /// The position of the grid of that name, or of the only grid if no name was given.
@@ -7,16 +8,13 @@ use nuage_vdb::{File, Source};
 /// # Errors
 /// What is wrong, with the names to choose from.
 pub(crate) fn find_grid<S: Source>(file: &File<S>, name: Option<&str>) -> Result<usize, String> {
-    let names = || {
-        let names: Vec<&str> = file.grids.iter().map(|grid| grid.unique_name.as_str()).collect();
-        names.join(", ")
-    };
-    match (name, file.grids.len()) {
-        (_, 0) => Err("the file has no grids".into()),
-        (Some(name), _) => {
-            file.find(name).ok_or_else(|| format!("grid '{name}' not found; the file has: {}", names()))
+    match (name, file.grids.as_slice()) {
+        (_, []) => Err("the file has no grids".into()),
+        (Some(name), _) => select::named_grid(file, name).map_err(|error| error.to_string()),
+        (None, [_]) => Ok(0),
+        (None, grids) => {
+            let names: Vec<&str> = grids.iter().map(|grid| grid.unique_name.as_str()).collect();
+            Err(format!("the file has several grids: {}; choose one with --grid NAME", names.join(", ")))
         }
-        (None, 1) => Ok(0),
-        (None, _) => Err(format!("the file has several grids: {}; choose one with --grid NAME", names())),
     }
 }

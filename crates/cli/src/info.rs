@@ -6,7 +6,7 @@
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 
-use nuage_vdb::{File, InternalNode, Source, Statistics, Tiles, Tree};
+use nuage_vdb::{File, Source, Statistics};
 use serde_json::Value;
 
 use crate::error::{Failure, explain};
@@ -137,7 +137,7 @@ fn look_into<S: Source>(file: &File<S>, index: usize, with_hashes: bool) -> Cont
         Ok(grid) => Contents::Decoded(Decoded {
             background: grid.tree.background,
             statistics: grid.tree.statistics(),
-            memory_bytes: memory_bytes(&grid.tree),
+            memory_bytes: grid.tree.memory_bytes(),
             hashes: with_hashes.then(|| Hashes {
                 topology: grid.tree.topology_hash(),
                 leaf_values: grid.tree.leaf_value_hash(),
@@ -145,20 +145,4 @@ fn look_into<S: Source>(file: &File<S>, index: usize, with_hashes: bool) -> Cont
         }),
         Err(error) => Contents::Damaged(explain(&error)),
     }
-}
-
-/// Memory that a tree's vectors hold, in bytes.
-fn memory_bytes(tree: &Tree) -> u64 {
-    let node = |node: &InternalNode| {
-        let masks = (node.child_mask.words().len() + node.value_mask.words().len()) * 10;
-        let tiles = match &node.tiles {
-            Tiles::Uniform(_) => 0,
-            Tiles::PerSlot(values) => size_of_val(&**values),
-        };
-        size_of_val(node) + masks + tiles
-    };
-    let nodes: usize = tree.nodes5.iter().chain(&tree.nodes4).map(node).sum();
-    let leaves = &tree.leaves;
-    let leaves = size_of_val(&*leaves.origins) + size_of_val(&*leaves.masks) + size_of_val(&*leaves.values);
-    (size_of_val(&*tree.root_tiles) + nodes + leaves) as u64
 }

@@ -79,17 +79,12 @@ pub(crate) fn probe(ijk: [i32; 3], voxel: Voxel) -> Value {
 }
 
 fn header(info: &GridInfo) -> Value {
-    // The values of a mask grid are the active states themselves: OpenVDB calls them bool.
-    let value_type = match info.value_type() {
-        "mask" => "bool",
-        other => other,
-    };
     let creator = info.metadata.get("creator").filter(|value| value.type_name == "string");
     json!({
         "name": characters(info.name.as_bytes()),
         "unique_name": characters(info.unique_name.as_bytes()),
         "grid_type": characters(info.grid_type.as_bytes()),
-        "value_type": characters(value_type.as_bytes()),
+        "value_type": characters(info.value_type().as_bytes()),
         "grid_class": info.grid_class(),
         "vector_type": vector_type(info),
         "creator": creator.map_or_else(String::new, |value| characters(&value.bytes)),

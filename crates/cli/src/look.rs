@@ -103,6 +103,10 @@ pub(crate) struct Look {
     #[arg(long, default_value = "4", value_parser = clap::value_parser!(u32).range(1..=65536), value_name = "N", help_heading = "Quality")]
     pub(crate) samples: u32,
 
+    /// A ray ends where less than this share of the light passes
+    #[arg(long, default_value = "0.0003", value_parser = share, value_name = "T", help_heading = "Quality")]
+    pub(crate) cutoff: f32,
+
     /// Shadow rays towards the sun per camera ray that is scattered whole; a large number means one per step
     #[arg(long, default_value = "24", value_parser = clap::value_parser!(u32).range(1..=1_000_000), value_name = "N", help_heading = "Quality")]
     pub(crate) sun_rays: u32,
@@ -110,6 +114,13 @@ pub(crate) struct Look {
     /// Shadow rays towards the sky per camera ray that is scattered whole
     #[arg(long, default_value = "8", value_parser = clap::value_parser!(u32).range(1..=65536), value_name = "N", help_heading = "Quality")]
     pub(crate) sky_rays: u32,
+}
+
+fn share(text: &str) -> Result<f32, String> {
+    match positive(text)? {
+        share if share < 1.0 => Ok(share),
+        _ => Err("a number between 0 and 1 is needed".into()),
+    }
 }
 
 fn up(text: &str) -> Result<DVec3, String> {

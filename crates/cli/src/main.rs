@@ -13,6 +13,7 @@ mod look;
 mod probe;
 mod progress;
 mod render;
+mod sample;
 mod shot;
 mod source;
 mod text;

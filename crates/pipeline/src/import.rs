@@ -23,6 +23,12 @@ use nuage_volume::space::BRICK_VOXELS;
 /// The most root cells (4096³ voxels each) that a background other than zero may fill.
 const MAX_BACKGROUND_CELLS: i64 = 4096;
 
+/// The most regions of 128³ voxels of one value that the active box may cut: each becomes up to 4096 tiles. About
+/// 300 MB and a second; a box of 2000³ voxels full of background takes 1500.
+const MAX_CUT_REGIONS: u64 = 2048;
+/// A region of 4096³ counts for as many: it becomes up to 32768 tiles, each of which costs more.
+const CUT_REGIONS_PER_NODE5: u64 = 32;
+
 /// Why a grid cannot become a channel.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum ImportError {
@@ -62,14 +68,15 @@ pub enum ImportError {
     },
 }
 
-/// What was changed on the way from grid to medium.
+/// What was changed on the way from grid to medium: values inside the active box that mean something else there.
+/// Each voxel of a leaf counts, each tile once however large it is, and the background once.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Report {
-    /// Stored values that were not a number and count as 0.
+    /// Values that were not a number and count as 0.
     pub nan_values: u64,
-    /// Stored values below zero that count as 0; in a level set none.
+    /// Values below zero that count as 0; in a level set none.
     pub negative_values: u64,
-    /// Stored values of +∞ that count as the largest finite number.
+    /// Values of +∞ that count as the largest finite number.
     pub infinite_values: u64,
     /// The depth in world units at which a level set's fog reaches 1, if the grid was one.
     pub level_set_band: Option<f32>,
@@ -128,14 +135,16 @@ pub fn import(grid: Grid) -> Result<(Channel, Report), ImportError> {
         meaning,
         clip,
         builder: TreeBuilder::new(),
+        report: Report::default(),
         tile_bricks: Vec::new(),
         placed: HashMap::new(),
+        cut_regions: 0,
     };
     importer.background(&grid)?;
     importer.tiles(&grid).map_err(build_error)?;
-    let (bricks, report) = importer.leaves(grid).map_err(build_error)?;
+    let bricks = importer.leaves(grid).map_err(build_error)?;
     let tree = importer.builder.finish(bricks).map_err(build_error)?;
-    Ok((Channel { tree, world_from_index, active_box }, report))
+    Ok((Channel { tree, world_from_index, active_box }, importer.report))
 }
 
 /// The affine transform of a grid.
@@ -151,8 +160,9 @@ pub fn linear_transform(info: &GridInfo) -> Result<DAffine3, ImportError> {
     // The rows of a row-vector matrix are the images of the axes.
     let [x, y, z, translation] = rows.map(|row| DVec3::new(row[0], row[1], row[2]));
     let affine = DAffine3 { matrix3: DMat3::from_cols(x, y, z), translation };
-    let inverse = affine.inverse();
-    match affine.is_finite() && inverse.is_finite() && affine.matrix3.determinant() != 0.0 {
+    // The volume that the axes span, next to that of a box of their lengths. False for NaN.
+    let spans_space = affine.matrix3.determinant().abs() > 1e-12 * x.length() * y.length() * z.length();
+    match spans_space && affine.inverse().is_finite() {
         true => Ok(affine),
         false => Err(ImportError::SingularTransform { grid: info.unique_name.clone() }),
     }
@@ -162,27 +172,39 @@ struct Importer {
     meaning: Meaning,
     clip: IndexBox,
     builder: TreeBuilder,
+    report: Report,
     /// Values of bricks that stem from tiles cut by the clip box. They come before those of the leaves.
     tile_bricks: Vec<f32>,
     /// Such bricks by the part that is filled and the bits of the value: many are alike.
     placed: HashMap<(IVec3, IVec3, u32), u32>,
+    /// How many regions were cut so far, at most [`MAX_CUT_REGIONS`].
+    cut_regions: u64,
 }
 
 impl Importer {
     /// Fills the clip box with the background wherever the root has no entry.
     fn background(&mut self, grid: &Grid) -> Result<(), ImportError> {
-        let value = self.meaning.density(grid.tree.background);
+        let tree = &grid.tree;
+        let (min, max): (IVec3, IVec3) = (self.clip.min >> 12, self.clip.max >> 12);
+        // At most 2⁶⁰: coordinates have 32 bits.
+        let cells = (max - min + 1).as_i64vec3().element_product();
+        let origins = tree.nodes5.iter().map(|node| node.origin);
+        let stored = origins.chain(tree.root_tiles.iter().map(|tile| tile.origin)).filter(|origin| {
+            let cell: IVec3 = IVec3::from_array(*origin) >> 12;
+            cell.cmpge(min).all() && cell.cmple(max).all()
+        });
+        if cells == stored.count() as i64 {
+            return Ok(());
+        }
+        self.note(tree.background);
+        let value = self.meaning.density(tree.background);
         if value == 0.0 {
             return Ok(());
         }
-        let (min, max): (IVec3, IVec3) = (self.clip.min >> 12, self.clip.max >> 12);
-        let cells = (max - min + 1).as_i64vec3();
-        let cells = cells.x.saturating_mul(cells.y).saturating_mul(cells.z);
+        let name = || grid.info.unique_name.clone();
         if cells > MAX_BACKGROUND_CELLS {
-            let grid = grid.info.unique_name.clone();
-            return Err(ImportError::Background { grid, cells, limit: MAX_BACKGROUND_CELLS });
+            return Err(ImportError::Background { grid: name(), cells, limit: MAX_BACKGROUND_CELLS });
         }
-        let tree = &grid.tree;
         for x in min.x..=max.x {
             for y in min.y..=max.y {
                 for z in min.z..=max.z {
@@ -190,9 +212,8 @@ impl Importer {
                     let stored = tree.nodes5.binary_search_by_key(&origin, |n| n.origin).is_ok()
                         || tree.root_tiles.binary_search_by_key(&origin, |t| t.origin).is_ok();
                     if !stored {
-                        self.constant(IVec3::from_array(origin) >> 3, TileSize::Node5, value).map_err(
-                            |source| ImportError::Build { grid: grid.info.unique_name.clone(), source },
-                        )?;
+                        self.constant(IVec3::from_array(origin) >> 3, TileSize::Node5, value)
+                            .map_err(|source| ImportError::Build { grid: name(), source })?;
                     }
                 }
             }
@@ -202,54 +223,72 @@ impl Importer {
 
     fn tiles(&mut self, grid: &Grid) -> Result<(), BuildError> {
         for tile in &grid.tree.root_tiles {
-            let value = self.meaning.density(tile.value);
-            self.constant(IVec3::from_array(tile.origin) >> 3, TileSize::Node5, value)?;
+            self.tile(tile.origin, TileSize::Node5, tile.value)?;
         }
         for (nodes, level, size) in
             [(&grid.tree.nodes5, LEVEL5, TileSize::Node4), (&grid.tree.nodes4, LEVEL4, TileSize::Brick)]
         {
             for node in nodes {
                 for (slot, value, _) in node.tile_slots() {
-                    let value = self.meaning.density(value);
-                    if value != 0.0 {
-                        let origin = level.child_origin(node.origin, slot);
-                        self.constant(IVec3::from_array(origin) >> 3, size, value)?;
-                    }
+                    self.tile(level.child_origin(node.origin, slot), size, value)?;
                 }
             }
         }
         Ok(())
     }
 
-    /// Adds a region of one value, cut to the clip box.
-    fn constant(&mut self, brick: IVec3, size: TileSize, value: f32) -> Result<(), BuildError> {
-        let (voxels, child) = match size {
-            TileSize::Brick => (8, None),
-            TileSize::Node4 => (128, Some((TileSize::Brick, 16, 1))),
-            TileSize::Node5 => (4096, Some((TileSize::Node4, 32, 16))),
-        };
-        let min: IVec3 = brick << 3;
-        let max = min + (voxels - 1);
-        let (inside_min, inside_max) = (min.max(self.clip.min), max.min(self.clip.max));
-        if value == 0.0 || inside_min.cmpgt(inside_max).any() {
+    fn tile(&mut self, origin: [i32; 3], size: TileSize, value: f32) -> Result<(), BuildError> {
+        let brick = IVec3::from_array(origin) >> 3;
+        if value == 0.0 || self.inside(brick, size).is_none() {
             return Ok(());
         }
-        if inside_min == min && inside_max == max {
+        self.note(value);
+        self.constant(brick, size, self.meaning.density(value))
+    }
+
+    /// Reports a value that does not count as it is.
+    fn note(&mut self, value: f32) {
+        self.report.nan_values += u64::from(value.is_nan());
+        if matches!(self.meaning, Meaning::Density) {
+            self.report.negative_values += u64::from(value < 0.0);
+            self.report.infinite_values += u64::from(value == f32::INFINITY);
+        }
+    }
+
+    /// The part of a region that lies in the clip box, relative to the region: first and last voxel.
+    fn inside(&self, brick: IVec3, size: TileSize) -> Option<(IVec3, IVec3)> {
+        let first: IVec3 = brick << 3;
+        let (min, max) = (self.clip.min.max(first), self.clip.max.min(first + (voxels(size) - 1)));
+        // The differences are small where the two overlap, and may overflow elsewhere.
+        min.cmple(max).all().then(|| (min - first, max - first))
+    }
+
+    /// Adds a region of one value, cut to the clip box.
+    fn constant(&mut self, brick: IVec3, size: TileSize, value: f32) -> Result<(), BuildError> {
+        let Some((min, max)) = self.inside(brick, size).filter(|_| value != 0.0) else { return Ok(()) };
+        if min == IVec3::ZERO && max == IVec3::splat(voxels(size) - 1) {
             return self.builder.tile(brick, size, value);
         }
-        match child {
-            Some((size, children, bricks)) => {
-                for x in 0..children {
-                    for y in 0..children {
-                        for z in 0..children {
-                            self.constant(brick + IVec3::new(x, y, z) * bricks, size, value)?;
-                        }
-                    }
-                }
-                Ok(())
-            }
-            None => self.cut_brick(brick, inside_min - min, inside_max - min, value),
+        let (child, regions) = match size {
+            TileSize::Brick => return self.cut_brick(brick, min, max, value),
+            TileSize::Node4 => (TileSize::Brick, 1),
+            TileSize::Node5 => (TileSize::Node4, CUT_REGIONS_PER_NODE5),
+        };
+        self.cut_regions += regions;
+        if self.cut_regions > MAX_CUT_REGIONS {
+            let what = "regions of 128³ voxels of one value that the active box cuts";
+            return Err(BuildError::Limit { what, limit: MAX_CUT_REGIONS });
         }
+        let (first, last) = (min / voxels(child), max / voxels(child));
+        for x in first.x..=last.x {
+            for y in first.y..=last.y {
+                for z in first.z..=last.z {
+                    let step = IVec3::new(x, y, z) * (voxels(child) / 8);
+                    self.constant(brick + step, child, value)?;
+                }
+            }
+        }
+        Ok(())
     }
 
     fn cut_brick(&mut self, brick: IVec3, min: IVec3, max: IVec3, value: f32) -> Result<(), BuildError> {
@@ -265,8 +304,8 @@ impl Importer {
         Ok(())
     }
 
-    /// Adds all leaves; gives the values of all bricks, and what was changed.
-    fn leaves(&mut self, grid: Grid) -> Result<(Bricks, Report), BuildError> {
+    /// Adds all leaves; gives the values of all bricks.
+    fn leaves(&mut self, grid: Grid) -> Result<Bricks, BuildError> {
         let Importer { meaning, clip, .. } = *self;
         let leaves = grid.tree.leaves;
         let origins = leaves.origins;
@@ -276,17 +315,16 @@ impl Importer {
             convert_leaf(origin, values, meaning, clip, may_be_half)
         });
 
-        let mut report = Report::default();
         if let Meaning::LevelSet { band } = meaning {
-            report.level_set_band = Some(band);
+            self.report.level_set_band = Some(band);
         }
         let mut kept = Vec::with_capacity(found.len());
         let mut exact_in_half =
             may_be_half && self.tile_bricks.iter().all(|v| f16::from_f32(*v).to_f32() == *v);
         for (i, leaf) in found.iter().enumerate() {
-            report.nan_values += u64::from(leaf.nan);
-            report.negative_values += u64::from(leaf.negative);
-            report.infinite_values += u64::from(leaf.infinite);
+            self.report.nan_values += u64::from(leaf.nan);
+            self.report.negative_values += u64::from(leaf.negative);
+            self.report.infinite_values += u64::from(leaf.infinite);
             let brick = IVec3::from_array(origins[i]) >> 3;
             let bounds = leaf.summary.low_bounds[0];
             if !bounds.is_constant() {
@@ -299,7 +337,7 @@ impl Importer {
         }
         drop(found);
         let tile_bricks = std::mem::take(&mut self.tile_bricks);
-        let bricks = if exact_in_half {
+        Ok(if exact_in_half {
             let mut packed = vec![0u16; tile_bricks.len() + kept.len() * BRICK_VOXELS];
             let (first, rest) = packed.split_at_mut(tile_bricks.len());
             to_half_bits(&tile_bricks, first);
@@ -313,8 +351,16 @@ impl Importer {
             first.copy_from_slice(&tile_bricks);
             copy_kept(&values, &kept, rest, |from, to| to.copy_from_slice(from));
             Bricks::F32(packed)
-        };
-        Ok((bricks, report))
+        })
+    }
+}
+
+/// The voxels per axis of a tile.
+fn voxels(size: TileSize) -> i32 {
+    match size {
+        TileSize::Brick => 8,
+        TileSize::Node4 => 128,
+        TileSize::Node5 => 4096,
     }
 }
 

@@ -1,6 +1,6 @@
 //! Which grid of a file a user means.
 
-use nuage_vdb::{File, Source};
+use nuage_vdb::{File, GridInfo, Source};
 
 /// Why no grid was found.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -39,15 +39,13 @@ pub fn named_grid<S: Source>(file: &File<S>, name: &str) -> Result<usize, Select
 /// # Errors
 /// If the file has no float grid.
 pub fn density_grid<S: Source>(file: &File<S>) -> Result<usize, SelectError> {
-    let readable = |index: &usize| file.grids[*index].is_readable();
-    let of_class = |class: &str| {
-        (0..file.grids.len()).filter(readable).find(|index| file.grids[*index].grid_class() == class)
+    let first = |wanted: &dyn Fn(&GridInfo) -> bool| {
+        file.grids.iter().position(|grid| grid.is_readable() && wanted(grid))
     };
-    file.find("density")
-        .filter(readable)
-        .or_else(|| of_class("fog volume"))
-        .or_else(|| of_class("level set"))
-        .or_else(|| (0..file.grids.len()).find(readable))
+    first(&|grid| grid.name == "density")
+        .or_else(|| first(&|grid| grid.grid_class() == "fog volume"))
+        .or_else(|| first(&|grid| grid.grid_class() == "level set"))
+        .or_else(|| first(&|_| true))
         .ok_or_else(|| {
             let names: Vec<String> = file
                 .grids

@@ -87,6 +87,37 @@ impl Image {
     }
 }
 
+/// Pictures side by side on an even, opaque ground of linear `colour`: row by row from the top left, `gap` pixels
+/// between neighbours and none around them. All cells have the size of the largest picture, and a smaller one
+/// lies at the top left of its cell. Fewer pictures than `columns` (at least 1) make a narrower sheet.
+///
+/// Fails without pictures, and when the sheet would be larger than [`MAX_PIXELS`].
+pub fn contact_sheet(
+    images: &[Image],
+    columns: u32,
+    gap: u32,
+    colour: [f32; 3],
+) -> Result<Image, ImageSizeError> {
+    let count = u32::try_from(images.len()).unwrap_or(u32::MAX);
+    let columns = columns.clamp(1, count.max(1));
+    let cell_width = images.iter().map(|image| image.width).max().unwrap_or(0);
+    let cell_height = images.iter().map(|image| image.height).max().unwrap_or(0);
+    // A sheet too large for u32 saturates, and is then refused for its area.
+    let side = |cells: u32, cell: u32| {
+        cells.saturating_mul(cell).saturating_add(gap.saturating_mul(cells.saturating_sub(1)))
+    };
+    let mut sheet = Image::new(side(columns, cell_width), side(count.div_ceil(columns), cell_height))?;
+    sheet.pixels.fill([colour[0], colour[1], colour[2], 1.0]);
+    for (i, image) in (0..count).zip(images) {
+        sheet.blit(
+            image,
+            (i % columns) * cell_width.saturating_add(gap),
+            (i / columns) * cell_height.saturating_add(gap),
+        );
+    }
+    Ok(sheet)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -142,6 +173,43 @@ mod tests {
                 assert_eq!(*pixel, [expected; 4], "pixel {i} at {left}, {top}");
             }
         }
+    }
+
+    #[test]
+    fn a_contact_sheet_shows_every_picture_in_its_cell() {
+        let colour = [0.25, 0.5, 0.75];
+        for (count, columns, gap) in [(5u32, 3u32, 2u32), (4, 2, 0), (1, 4, 9), (3, 1, 1), (2, 0, 1)] {
+            let picture = |n: u32| Image { pixels: vec![[n as f32; 4]; 12], width: 4, height: 3 };
+            let images: Vec<Image> = (2..2 + count).map(picture).collect();
+            let sheet = contact_sheet(&images, columns, gap, colour).unwrap();
+            let columns = columns.clamp(1, count);
+            let rows = count.div_ceil(columns);
+            assert_eq!(
+                (sheet.width, sheet.height),
+                (columns * (4 + gap) - gap, rows * (3 + gap) - gap),
+                "{count} in {columns}"
+            );
+            for (i, pixel) in (0u32..).zip(&sheet.pixels) {
+                let (x, y) = (i % sheet.width, i / sheet.width);
+                let n = y / (3 + gap) * columns + x / (4 + gap);
+                let inside = x % (4 + gap) < 4 && y % (3 + gap) < 3 && n < count;
+                let expected = if inside { [2.0 + n as f32; 4] } else { [0.25, 0.5, 0.75, 1.0] };
+                assert_eq!(*pixel, expected, "{x}, {y} of {count} in {columns}");
+            }
+        }
+    }
+
+    #[test]
+    fn impossible_contact_sheets_are_refused() {
+        assert!(contact_sheet(&[], 4, 1, [0.0; 3]).is_err());
+        let pair = [numbered(2, 1), numbered(1, 2)];
+        for gap in [u32::MAX, u32::MAX - 1, u32::MAX / 2, 1 << 26] {
+            assert!(contact_sheet(&pair, 2, gap, [0.0; 3]).is_err(), "{gap}");
+            assert!(contact_sheet(&pair, 1, gap, [0.0; 3]).is_err(), "{gap}");
+        }
+        assert_eq!(contact_sheet(&pair, 2, 0, [0.0; 3]).map(|sheet| (sheet.width, sheet.height)), Ok((4, 2)));
+        // A gap that nobody sees does not matter.
+        assert!(contact_sheet(&pair[..1], 1, u32::MAX, [0.0; 3]).is_ok());
     }
 
     #[test]

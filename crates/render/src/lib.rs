@@ -1,7 +1,8 @@
 //! The CPU renderer: the reference that every other renderer of the project is held to.
 //!
 //! [`scene`] says what is rendered and [`camera`] from where; [`traverse`] walks rays through the packed tree;
-//! [`march`] integrates light along them; [`picture`] runs that over all pixels; [`framing`] finds views and
+//! [`blocks`] keeps the
+//! decoded bricks near a thread's rays; [`march`] integrates light along them; [`picture`] runs that over all pixels; [`framing`] finds views and
 //! densities for volumes that nobody described; [`film`] and [`output`] hold and encode pictures. Physics in
 //! small functions: [`phase`], [`color`], [`math`], [`hash`].
 //!
@@ -11,6 +12,7 @@
 
 #![forbid(unsafe_code)]
 
+pub mod blocks;
 pub mod camera;
 pub mod color;
 pub mod film;

@@ -17,17 +17,14 @@
 use glam::Vec3;
 use nuage_volume::accessor::Accessor;
 
+use crate::blocks::Blocks;
 use crate::camera::Ray;
 use crate::hash::{hash_u32, unit_f32};
 use crate::math::{exp, one_minus_exp_neg};
 use crate::phase::{hg, sample_hg};
 use crate::scene::{Emission, Scene};
-use crate::traverse::{Field, LocalRay, Run, RunKind, Runs, floor};
+use crate::traverse::{Field, LocalRay, Reader, Run, RunKind, Runs, floor};
 
-/// A camera ray ends where less of the light behind passes than this.
-const MIN_TRANSMITTANCE: f32 = 2e-4;
-/// A shadow ray ends where its optical depth is more than this: less than 1.3e-4 of the light passes.
-const MAX_SHADOW_DEPTH: f32 = 9.0;
 /// A lit homogeneous run is cut after this optical depth, …
 const LIT_PIECE_DEPTH: f32 = 0.25;
 /// … or after this many voxels, whichever is shorter.
@@ -46,6 +43,8 @@ pub struct Quality {
     pub step_voxels: f32,
     /// The length of a step of a shadow ray, in voxels.
     pub shadow_step_voxels: f32,
+    /// A ray ends where less than this share of the light passes.
+    pub min_transmittance: f32,
     /// Shadow rays towards the sun for a camera ray all of whose light is scattered; more where the medium is
     /// thin and long. Without bound: one per step.
     pub sun_rays: u32,
@@ -57,7 +56,14 @@ pub struct Quality {
 
 impl Default for Quality {
     fn default() -> Self {
-        Quality { step_voxels: 0.5, shadow_step_voxels: 1.0, sun_rays: 24, sky_rays: 8, samples: 1 }
+        Quality {
+            step_voxels: 0.5,
+            shadow_step_voxels: 1.0,
+            min_transmittance: 3e-4,
+            sun_rays: 24,
+            sky_rays: 8,
+            samples: 1,
+        }
     }
 }
 
@@ -77,13 +83,30 @@ pub struct Marcher<'s> {
     density: Option<Field<'s>>,
     emission: Option<(Field<'s>, &'s Emission<'s>)>,
     sky: Option<Vec3>,
+    /// The optical depth at which a shadow ray ends.
+    max_shadow_depth: f32,
 }
 
-/// What one thread needs to march: readers that remember where they were.
+/// What one thread needs to march.
 pub struct Worker<'s> {
-    density: Option<Accessor<'s>>,
-    shadow: Option<Accessor<'s>>,
-    emission: Option<Accessor<'s>>,
+    density: Option<Reader<'s>>,
+    emission: Option<Reader<'s>>,
+}
+
+/// The part of a [`Reader`] that shadow rays use, and all samples.
+struct ShadowReader<'w, 's> {
+    walker: &'w mut Accessor<'s>,
+    blocks: &'w mut Blocks<'s>,
+}
+
+/// The walker of the camera ray apart from the rest of a reader.
+fn split<'w, 's>(
+    reader: Option<&'w mut Reader<'s>>,
+) -> (Option<&'w mut Accessor<'s>>, Option<ShadowReader<'w, 's>>) {
+    let parts = reader.map(|Reader { walker, shadow_walker, blocks }| {
+        (walker, ShadowReader { walker: shadow_walker, blocks })
+    });
+    parts.unzip()
 }
 
 /// The light on the medium along one camera ray.
@@ -129,15 +152,15 @@ impl<'s> Marcher<'s> {
             density: Field::new(scene.medium.density),
             emission: emission.and_then(|e| Some((Field::new(e.channel)?, e))),
             sky: (sky != Vec3::ZERO && quality.sky_rays > 0).then_some(sky),
+            max_shadow_depth: -quality.min_transmittance.clamp(f32::MIN_POSITIVE, 1.0).ln(),
         }
     }
 
     /// What a thread needs to call the other functions.
     pub fn worker(&self) -> Worker<'s> {
         Worker {
-            density: self.density.as_ref().map(Field::accessor),
-            shadow: self.density.as_ref().map(Field::accessor),
-            emission: self.emission.as_ref().map(|(field, _)| field.accessor()),
+            density: self.density.as_ref().map(Field::reader),
+            emission: self.emission.as_ref().map(|(field, _)| field.reader()),
         }
     }
 
@@ -151,8 +174,8 @@ impl<'s> Marcher<'s> {
         let Some(start) = starts.into_iter().flatten().reduce(f64::min) else { return result };
         let span = |interval: [f64; 2]| interval.map(|t| (t - start) as f32);
 
-        let mut density = density.map(|(field, interval)| (field, field.local(ray, start), span(interval)));
-        let mut emission = emission.map(|(field, e, i)| (field, e, field.local(ray, start), span(i)));
+        let density = density.map(|(field, interval)| (field, field.local(ray, start), span(interval)));
+        let emission = emission.map(|(field, e, i)| (field, e, field.local(ray, start), span(i)));
         let scale = self.scene.medium.density_scale;
         let voxels_per_length = [
             density.as_ref().map_or(0.0, |(_, local, _)| local.direction.length()),
@@ -164,18 +187,16 @@ impl<'s> Marcher<'s> {
         let mut lighting =
             density.as_ref().map(|(field, local, _)| Lighting::new(self, field, ray, *local, random));
 
-        // Two readers per channel: one finds the runs, the other samples them.
-        let Worker { density: sampler, shadow, emission: glow } = worker;
-        let mut run_reader = density.as_ref().map(|(field, ..)| field.accessor());
-        let mut glow_reader = emission.as_ref().map(|(field, ..)| field.accessor());
+        let (mut walker, mut shadow) = split(worker.density.as_mut());
+        let (mut glow_walker, mut glow) = split(worker.emission.as_mut());
         let density_runs = density
-            .as_mut()
-            .zip(run_reader.as_mut())
-            .map(|((field, local, [t0, t1]), reader)| field.runs(reader, *local, *t0, *t1));
+            .as_ref()
+            .zip(walker.as_mut())
+            .map(|((field, local, [t0, t1]), walker)| field.runs(walker, *local, *t0, *t1));
         let emission_runs = emission
-            .as_mut()
-            .zip(glow_reader.as_mut())
-            .map(|((field, _, local, [t0, t1]), reader)| field.runs(reader, *local, *t0, *t1));
+            .as_ref()
+            .zip(glow_walker.as_mut())
+            .map(|((field, _, local, [t0, t1]), walker)| field.runs(walker, *local, *t0, *t1));
         let lit = lighting.as_ref().is_some_and(Lighting::is_lit);
         for piece in Pieces::new(density_runs, emission_runs) {
             let density_kind = piece.kinds[0];
@@ -187,16 +208,16 @@ impl<'s> Marcher<'s> {
             };
             let mut step = |t0: f32, t1: f32| {
                 let t = 0.5 * (t0 + t1);
-                let value = match (density_kind, &density, sampler.as_mut()) {
-                    (Some(RunKind::Varying), Some((field, local, _)), Some(sampler)) => {
-                        field.sample(sampler, local.at(t))
+                let value = match (density_kind, &density, shadow.as_mut()) {
+                    (Some(RunKind::Varying), Some((field, local, _)), Some(shadow)) => {
+                        field.sample(shadow.blocks, local.at(t))
                     }
                     (kind, ..) => constant(kind),
                 };
                 let emitted = match (emission_kind, &emission, glow.as_mut()) {
                     (None, ..) | (_, None, _) => Vec3::ZERO,
                     (Some(RunKind::Varying), Some((field, e, local, _)), Some(glow)) => {
-                        e.spectrum.radiance(field.sample(glow, local.at(t)))
+                        e.spectrum.radiance(field.sample(glow.blocks, local.at(t)))
                     }
                     (kind, Some((_, e, ..)), _) => e.spectrum.radiance(constant(kind)),
                 };
@@ -214,7 +235,7 @@ impl<'s> Marcher<'s> {
                 // ∫ e^(−σt) dt over the step is absorbed / σ.
                 result.scattered += result.transmittance * (length * (absorbed / depth)) * emitted;
                 result.transmittance *= 1.0 - absorbed;
-                result.transmittance > MIN_TRANSMITTANCE
+                result.transmittance > self.quality.min_transmittance
             };
             let goes_on = if varying {
                 lattice.steps(piece.t0, piece.t1, &mut step)
@@ -238,18 +259,20 @@ impl<'s> Marcher<'s> {
 
     /// The optical depth of a camera ray per unit of density scale.
     pub fn depth_per_scale(&self, worker: &mut Worker<'s>, ray: &Ray) -> f32 {
-        let (Some(field), Some(reader)) = (&self.density, &mut worker.shadow) else { return 0.0 };
+        let (Some(field), (_, Some(mut reader))) = (&self.density, split(worker.density.as_mut())) else {
+            return 0.0;
+        };
         let Some([start, end]) = field.interval(ray) else { return 0.0 };
         let local = field.local(ray, start);
         let lattice = Lattice::new(self.quality.step_voxels, &local, 0.5);
-        optical_depth(field, reader, &local, (end - start) as f32, lattice, 1.0, f32::INFINITY)
+        optical_depth(field, &mut reader, &local, (end - start) as f32, lattice, 1.0, f32::INFINITY)
     }
 }
 
 /// The optical depth of a ray from t = 0 to `end`, given up once it passes `limit`.
 fn optical_depth<'s>(
     field: &Field<'s>,
-    sampler: &mut Accessor<'s>,
+    reader: &mut ShadowReader<'_, 's>,
     ray: &LocalRay,
     end: f32,
     lattice: Lattice,
@@ -257,13 +280,13 @@ fn optical_depth<'s>(
     limit: f32,
 ) -> f32 {
     let mut depth = 0.0;
-    let mut reader = sampler.clone();
-    for run in field.runs(&mut reader, *ray, 0.0, end) {
+    let ShadowReader { walker, blocks } = reader;
+    for run in field.runs(walker, *ray, 0.0, end) {
         match run.kind {
             RunKind::Constant(value) => depth += value * scale * (run.t1 - run.t0),
             RunKind::Varying => {
                 lattice.steps(run.t0, run.t1, &mut |t0, t1| {
-                    let value = field.sample(sampler, ray.at(0.5 * (t0 + t1)));
+                    let value = field.sample(blocks, ray.at(0.5 * (t0 + t1)));
                     depth += value * scale * (t1 - t0);
                     depth <= limit
                 });
@@ -317,7 +340,7 @@ impl<'m, 's> Lighting<'m, 's> {
     /// The light scattered towards the camera by a step that accounts for `share` of the camera's light, or by
     /// a group of steps that ends with it.
     #[inline]
-    fn scattered(&mut self, shadow: &mut Accessor<'s>, t0: f32, t1: f32, share: f32) -> Vec3 {
+    fn scattered(&mut self, shadow: &mut ShadowReader<'_, 's>, t0: f32, t1: f32, share: f32) -> Vec3 {
         let mut light = Vec3::ZERO;
         let t = 0.5 * (t0 + t1);
         if self.sun.is_some() {
@@ -346,7 +369,7 @@ impl<'m, 's> Lighting<'m, 's> {
     }
 
     /// The sun's light that the steps since the last call scatter towards the camera.
-    fn close_group(&mut self, shadow: &mut Accessor<'s>) -> Vec3 {
+    fn close_group(&mut self, shadow: &mut ShadowReader<'_, 's>) -> Vec3 {
         let Group { share, moment, .. } = std::mem::take(&mut self.group);
         match self.sun {
             Some((radiance, direction)) if share > 0.0 => {
@@ -369,7 +392,7 @@ impl<'m, 's> Lighting<'m, 's> {
         self.density.directions() * direction
     }
 
-    fn transmittance(&self, shadow: &mut Accessor<'s>, position: Vec3, direction: Vec3) -> f32 {
+    fn transmittance(&self, shadow: &mut ShadowReader<'_, 's>, position: Vec3, direction: Vec3) -> f32 {
         let ray = LocalRay::new(position, direction);
         // The position itself scrambles the lattice, so that neighbouring steps do not share its error.
         let bits = position.x.to_bits()
@@ -379,7 +402,8 @@ impl<'m, 's> Lighting<'m, 's> {
         let lattice = Lattice::new(self.marcher.quality.shadow_step_voxels, &ray, shift);
         let scale = self.marcher.scene.medium.density_scale;
         let end = self.density.exit(&ray);
-        exp(-optical_depth(self.density, shadow, &ray, end, lattice, scale, MAX_SHADOW_DEPTH))
+        let limit = self.marcher.max_shadow_depth;
+        exp(-optical_depth(self.density, shadow, &ray, end, lattice, scale, limit))
     }
 }
 

@@ -6,7 +6,7 @@ use glam::DVec2;
 
 use crate::film::{Image, ImageSizeError};
 use crate::hash::{hash_pixel, unit_f32};
-use crate::march::{Marcher, Quality};
+use crate::march::{Marcher, Quality, Worker};
 use crate::scene::Scene;
 
 /// Pixels per side of a tile, the unit of work of a thread.
@@ -18,8 +18,8 @@ const TILE: u32 = 16;
 ///
 /// # Errors
 /// If the picture has no pixels or too many.
-pub fn render(
-    scene: &Scene<'_>,
+pub fn render<'s>(
+    scene: &'s Scene<'s>,
     quality: Quality,
     width: u32,
     height: u32,
@@ -29,18 +29,17 @@ pub fn render(
     let marcher = Marcher::new(scene, quality);
     let (columns, rows) = (width.div_ceil(TILE), height.div_ceil(TILE));
     let done = std::sync::atomic::AtomicU32::new(0);
-    let render_tile = |tile: u32| -> Image {
+    let render_tile = |worker: &mut Worker<'s>, tile: u32| -> Image {
         let (left, top) = (tile % columns * TILE, tile / columns * TILE);
         let size = [TILE.min(width - left), TILE.min(height - top)];
         let mut part = Image::new(size[0], size[1]).expect("a tile is smaller than its picture");
-        let mut worker = marcher.worker();
         for (i, pixel) in part.pixels.iter_mut().enumerate() {
             let (x, y) = (left + i as u32 % size[0], top + i as u32 / size[0]);
             let mut sum = [0.0; 4];
             for sample in 0..quality.samples.max(1) {
                 let offset = pixel_offset(x, y, sample, quality.samples);
                 let ray = scene.camera.ray(DVec2::new(x.into(), y.into()) + offset, width, height);
-                let light = marcher.radiance(&mut worker, &ray, hash_pixel(x, y, sample, 2));
+                let light = marcher.radiance(worker, &ray, hash_pixel(x, y, sample, 2));
                 let [r, g, b] = light.scattered.to_array();
                 for (sum, value) in sum.iter_mut().zip([r, g, b, 1.0 - light.transmittance]) {
                     *sum += value;
@@ -55,10 +54,13 @@ pub fn render(
     #[cfg(feature = "parallel")]
     let tiles: Vec<Image> = {
         use rayon::prelude::*;
-        (0..columns * rows).into_par_iter().map(render_tile).collect()
+        (0..columns * rows).into_par_iter().map_init(|| marcher.worker(), render_tile).collect()
     };
     #[cfg(not(feature = "parallel"))]
-    let tiles: Vec<Image> = (0..columns * rows).map(render_tile).collect();
+    let tiles: Vec<Image> = {
+        let mut worker = marcher.worker();
+        (0..columns * rows).map(|tile| render_tile(&mut worker, tile)).collect()
+    };
     for (tile, part) in (0u32..).zip(&tiles) {
         image.blit(part, tile % columns * TILE, tile / columns * TILE);
     }

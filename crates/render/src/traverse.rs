@@ -13,6 +13,7 @@ use nuage_volume::accessor::Accessor;
 use nuage_volume::channel::Channel;
 use nuage_volume::tree::Content;
 
+use crate::blocks::Blocks;
 use crate::camera::Ray;
 
 /// A channel made ready for rays: its transform inverted, its extent in the coordinates of the walk.
@@ -30,6 +31,17 @@ pub struct Field<'a> {
     brick_box: [IVec3; 2],
     /// Where samples can be other than zero, as positions.
     bounds: [DVec3; 2],
+}
+
+/// What one thread needs to read a [`Field`]: places that it remembers.
+#[derive(Debug, Clone)]
+pub struct Reader<'a> {
+    /// Where the camera ray walks.
+    pub walker: Accessor<'a>,
+    /// Where the shadow ray walks.
+    pub shadow_walker: Accessor<'a>,
+    /// The values near both.
+    pub blocks: Blocks<'a>,
 }
 
 /// A ray in the positions of a [`Field`], `p(t) = origin + t × direction`.
@@ -71,7 +83,8 @@ impl<'a> Field<'a> {
         }
         // Interpolation reaches one voxel beyond the box on both sides.
         let (min, max) = (active.min.saturating_sub(IVec3::ONE), active.max);
-        let base_brick: IVec3 = min >> 3;
+        // One brick before the first, so that positions are not negative.
+        let base_brick: IVec3 = (min >> 3) - 1;
         let base: IVec3 = base_brick << 3;
         let base = base.as_dvec3();
         let inverse = channel.world_from_index.inverse();
@@ -80,14 +93,18 @@ impl<'a> Field<'a> {
             index_from_world: inverse.matrix3,
             offset: inverse.translation - base,
             base_brick,
-            brick_box: [base_brick, max >> 3],
+            brick_box: [min >> 3, max >> 3],
             bounds: [min.as_dvec3() - base, max.as_dvec3() + 1.0 - base],
         })
     }
 
-    /// A reader of the values.
-    pub fn accessor(&self) -> Accessor<'a> {
-        Accessor::new(&self.channel.tree)
+    /// What a thread needs to read the field.
+    pub fn reader(&self) -> Reader<'a> {
+        Reader {
+            walker: Accessor::new(&self.channel.tree),
+            shadow_walker: Accessor::new(&self.channel.tree),
+            blocks: Blocks::new(&self.channel.tree),
+        }
     }
 
     /// Where a ray enters and leaves the field, as distances from its origin.
@@ -135,16 +152,23 @@ impl<'a> Field<'a> {
 
     /// The value at a position.
     #[inline]
-    pub fn sample(&self, accessor: &mut Accessor<'a>, position: Vec3) -> f32 {
-        let cell = IVec3::new(floor(position.x), floor(position.y), floor(position.z));
-        let fraction = position - cell.as_vec3();
-        accessor.trilinear_in_cell(cell.wrapping_add(self.base_brick << 3), fraction)
+    pub fn sample(&self, blocks: &mut Blocks<'a>, position: Vec3) -> f32 {
+        // Adding 2^23 to a number that is smaller and not negative rounds it to an integer that stands in the
+        // low bits: cheaper than a conversion that must saturate. An integer position may round to the cell
+        // before it, whose far corner it then is.
+        const SHIFT: f32 = 8_388_608.0;
+        let shifted = (position - 0.5) + SHIFT;
+        let integer = |x: f32| (x.to_bits() & 0x007f_ffff) as i32;
+        let cell = IVec3::new(integer(shifted.x), integer(shifted.y), integer(shifted.z));
+        let fraction = position - (shifted - SHIFT);
+        blocks.trilinear_in_cell(cell.wrapping_add(self.base_brick << 3), fraction)
     }
 
     /// The runs of a ray between `t0` and `t1`, both inside the field.
     pub fn runs<'r>(&self, accessor: &'r mut Accessor<'a>, ray: LocalRay, t0: f32, t1: f32) -> Runs<'r, 'a> {
         let position = (ray.origin + ray.direction * t0) * 0.125;
         let brick = IVec3::new(floor(position.x), floor(position.y), floor(position.z));
+        let forward = ray.direction.cmpge(Vec3::ZERO);
         let mut runs = Runs {
             accessor,
             ray,
@@ -155,6 +179,8 @@ impl<'a> Field<'a> {
             t_end: t1,
             t_next: Vec3::INFINITY,
             t_brick: (8.0 * ray.inverse).abs(),
+            sign: IVec3::select(forward, IVec3::ONE, IVec3::NEG_ONE),
+            brick_end: IVec3::select(forward, self.brick_box[1] + 1, self.brick_box[0] - 1),
             tile_parts: [None; 3],
             held: None,
         };
@@ -210,6 +236,9 @@ pub struct Runs<'r, 'a> {
     /// Where the ray leaves that brick along each axis, and the distance between its faces.
     t_next: Vec3,
     t_brick: Vec3,
+    /// The step to the next brick along each axis, and the first brick outside in that direction.
+    sign: IVec3,
+    brick_end: IVec3,
     /// What is left of a large tile, last part first.
     tile_parts: [Option<Run>; 3],
     /// A varying run that may go on.
@@ -223,31 +252,27 @@ impl Runs<'_, '_> {
             return Some(run);
         }
         while self.t < self.t_end {
-            let region = self.accessor.region(self.brick);
+            let (log2_bricks, footprint) = self.accessor.footprint(self.brick);
             let (t0, brick) = (self.t, self.brick);
-            if region.log2_bricks == 0 {
+            if log2_bricks == 0 {
                 self.step_brick();
             } else {
-                self.leap(region.log2_bricks);
+                self.leap(log2_bricks);
             }
             let t1 = self.t.min(self.t_end);
-            let bounds = region.footprint;
-            if t0 >= t1 || (bounds.max == 0.0 && bounds.min == 0.0) {
+            if (footprint.max == 0.0 && footprint.min == 0.0) || t0 >= t1 {
                 continue;
             }
-            if bounds.is_constant() {
-                return Some(Run { t0, t1, kind: RunKind::Constant(bounds.max) });
+            if footprint.is_constant() {
+                return Some(Run { t0, t1, kind: RunKind::Constant(footprint.max) });
             }
-            if region.log2_bricks > 0
-                && let Content::Constant(value) = region.content
-            {
-                self.split_tile(brick, region.log2_bricks, value, t0, t1);
-                if let Some(run) = self.next_of_tile() {
-                    return Some(run);
-                }
-                continue;
+            if log2_bricks == 0 {
+                return Some(Run { t0, t1, kind: RunKind::Varying });
             }
-            return Some(Run { t0, t1, kind: RunKind::Varying });
+            self.split_tile(brick, t0, t1);
+            if let Some(run) = self.next_of_tile() {
+                return Some(run);
+            }
         }
         None
     }
@@ -256,22 +281,21 @@ impl Runs<'_, '_> {
     #[inline]
     fn step_brick(&mut self) {
         let Vec3 { x, y, z } = self.t_next;
-        let axis = if x <= y && x <= z {
-            0
+        // Written out per axis: indexing by a variable takes vectors through memory.
+        let (t, outside) = if x <= y && x <= z {
+            self.t_next.x += self.t_brick.x;
+            self.brick.x += self.sign.x;
+            (x, self.brick.x == self.brick_end.x)
         } else if y <= z {
-            1
+            self.t_next.y += self.t_brick.y;
+            self.brick.y += self.sign.y;
+            (y, self.brick.y == self.brick_end.y)
         } else {
-            2
+            self.t_next.z += self.t_brick.z;
+            self.brick.z += self.sign.z;
+            (z, self.brick.z == self.brick_end.z)
         };
-        self.t = self.t.max(self.t_next[axis]);
-        self.t_next[axis] += self.t_brick[axis];
-        let forward = self.ray.direction[axis] >= 0.0;
-        self.brick[axis] += if forward { 1 } else { -1 };
-        let outside = if forward {
-            self.brick[axis] > self.brick_box[1][axis]
-        } else {
-            self.brick[axis] < self.brick_box[0][axis]
-        };
+        self.t = self.t.max(t);
         if outside {
             self.t_end = self.t_end.min(self.t);
         }
@@ -318,8 +342,14 @@ impl Runs<'_, '_> {
     }
 
     /// Cuts the stretch of a large tile at its homogeneous part.
-    fn split_tile(&mut self, brick: IVec3, log2_bricks: u32, value: f32, t0: f32, t1: f32) {
-        let (origin, last) = extent(brick, log2_bricks);
+    fn split_tile(&mut self, brick: IVec3, t0: f32, t1: f32) {
+        let region = self.accessor.region(brick);
+        let (origin, last) = extent(brick, region.log2_bricks);
+        let value = match region.content {
+            Content::Constant(value) => value,
+            // Only bricks are not constant, and they are no tiles.
+            Content::Brick(_) => 0.0,
+        };
         let position = |brick: IVec3| (brick - self.base_brick).as_vec3() * 8.0;
         let [a, b] = self.ray.box_interval(position(origin), position(last + 1) - 1.0);
         // A ray that misses the homogeneous part has its whole stretch in the layer.

@@ -70,10 +70,14 @@ pub struct Grid {
 }
 
 impl GridInfo {
-    /// The value type that the grid type names: `float`, `vec3s`, `ptdataidx32`, …
+    /// The type of the values: `float`, `vec3s`, `ptdataidx32`, … as the grid type names it, but `bool` for
+    /// mask grids, whose values are the active states themselves.
     pub fn value_type(&self) -> &str {
         let name = self.grid_type.strip_prefix("Tree_").unwrap_or(&self.grid_type);
-        name.split('_').next().unwrap_or(name)
+        match name.split('_').next().unwrap_or(name) {
+            "mask" => "bool",
+            other => other,
+        }
     }
 
     /// `"fog volume"`, `"level set"`, `"staggered"` or `"unknown"`.

@@ -1,7 +1,7 @@
 //! Statistics of a tree: counts, boxes, extremes and hashes, with the meanings OpenVDB gives them.
 
 use crate::mask::bits;
-use crate::tree::{InternalNode, LEAF_VOXELS, LEVEL4, LEVEL5, Level, Tree};
+use crate::tree::{InternalNode, LEVEL4, LEVEL5, Level, RootTile, Tree};
 
 /// A box of index coordinates `[min, max]`, both ends included.
 pub type IndexBox = [[i32; 3]; 2];
@@ -29,29 +29,24 @@ pub struct Statistics {
 impl Tree {
     /// Counts, boxes and extremes of the tree.
     pub fn statistics(&self) -> Statistics {
-        let mut seen = Seen { min_max: None, nan_count: 0, bbox: None };
+        let mut seen = Seen { min_max: None, nan_count: 0 };
         let (mut active_voxels, mut active_tiles) = (0u64, 0u64);
-        for tile in self.root_tiles.iter().filter(|tile| tile.active) {
+        for tile in self.active_tiles() {
             active_tiles += 1;
-            active_voxels = active_voxels.saturating_add(1 << 36);
+            active_voxels = active_voxels.saturating_add(1 << (3 * tile.log2_voxels));
             seen.value(tile.value);
-            seen.cube(tile.origin, 12);
         }
-        for (nodes, level) in [(&self.nodes5, LEVEL5), (&self.nodes4, LEVEL4)] {
-            for node in nodes {
-                let count = seen.tiles(node, level);
-                active_tiles += count;
-                active_voxels = active_voxels.saturating_add(count << (3 * level.log2_child_voxels));
-            }
-        }
-        let mut leaf_bbox = seen.bbox;
+        let mut leaf_bbox = self.active_tile_bbox();
         for (i, (origin, mask)) in self.leaves.origins.iter().zip(&self.leaves.masks).enumerate() {
             let active = mask.iter().map(|word| u64::from(word.count_ones())).sum::<u64>();
             active_voxels = active_voxels.saturating_add(active);
             if active > 0 {
                 grow(&mut leaf_bbox, *origin, origin.map(|c| c.wrapping_add(7)));
             }
-            seen.leaf(*origin, mask, self.leaves.values(i));
+            let values = self.leaves.values(i);
+            for (x, word) in mask.iter().enumerate() {
+                bits(*word).for_each(|bit| seen.value(values[x * 64 + bit]));
+            }
         }
         Statistics {
             active_voxels,
@@ -62,31 +57,37 @@ impl Tree {
                 self.nodes5.len() as u64,
                 1,
             ],
-            active_bbox: seen.bbox,
+            active_bbox: self.active_bbox(),
             leaf_bbox: leaf_bbox.filter(|_| !self.leaves.is_empty()),
             min_max: seen.min_max,
             nan_count: seen.nan_count,
         }
     }
 
-    /// The box of all active voxels and tiles: that of [`Tree::statistics`], without looking at values.
+    /// The box of all active voxels and tiles, without looking at values.
     pub fn active_bbox(&self) -> Option<IndexBox> {
-        let mut bbox = None;
-        let mut cube = |origin: [i32; 3], log2_voxels: u32| {
-            grow(&mut bbox, origin, origin.map(|c| c.wrapping_add((1 << log2_voxels) - 1)));
-        };
-        self.root_tiles.iter().filter(|tile| tile.active).for_each(|tile| cube(tile.origin, 12));
-        for (nodes, level) in [(&self.nodes5, LEVEL5), (&self.nodes4, LEVEL4)] {
-            for node in nodes {
-                for slot in node.value_mask.iter().filter(|slot| !node.child_mask.contains(*slot)) {
-                    cube(level.child_origin(node.origin, slot), level.log2_child_voxels);
-                }
-            }
-        }
+        let mut bbox = self.active_tile_bbox();
         for (origin, mask) in self.leaves.origins.iter().zip(&self.leaves.masks) {
             grow_to_leaf(&mut bbox, *origin, mask);
         }
         bbox
+    }
+
+    fn active_tile_bbox(&self) -> Option<IndexBox> {
+        let mut bbox = None;
+        for ActiveTile { origin, log2_voxels, .. } in self.active_tiles() {
+            grow(&mut bbox, origin, origin.map(|c| c.wrapping_add((1 << log2_voxels) - 1)));
+        }
+        bbox
+    }
+
+    fn active_tiles(&self) -> impl Iterator<Item = ActiveTile> + '_ {
+        let of_root =
+            |tile: &RootTile| ActiveTile { origin: tile.origin, log2_voxels: 12, value: tile.value };
+        let root_tiles = self.root_tiles.iter().filter(|tile| tile.active).map(of_root);
+        let tiles5 = self.nodes5.iter().flat_map(|node| active_tiles_of(node, LEVEL5));
+        let tiles4 = self.nodes4.iter().flat_map(|node| active_tiles_of(node, LEVEL4));
+        root_tiles.chain(tiles5).chain(tiles4)
     }
 
     /// FNV-1a hash over origin (three little-endian i32) and mask (64 bytes) of every leaf, in leaf order.
@@ -134,10 +135,26 @@ fn grow(bbox: &mut Option<IndexBox>, min: [i32; 3], max: [i32; 3]) {
     }
 }
 
+/// An active region of one value.
+struct ActiveTile {
+    origin: [i32; 3],
+    log2_voxels: u32,
+    value: f32,
+}
+
+fn active_tiles_of(node: &InternalNode, level: Level) -> impl Iterator<Item = ActiveTile> + '_ {
+    let slots = node.value_mask.iter().filter(|slot| !node.child_mask.contains(*slot));
+    slots.map(move |slot| ActiveTile {
+        origin: level.child_origin(node.origin, slot),
+        log2_voxels: level.log2_child_voxels,
+        value: node.tiles.value(slot),
+    })
+}
+
+/// Extremes of the values that are numbers, and how many are not.
 struct Seen {
     min_max: Option<[f32; 2]>,
     nan_count: u64,
-    bbox: Option<IndexBox>,
 }
 
 impl Seen {
@@ -149,28 +166,6 @@ impl Seen {
         let [min, max] = self.min_max.get_or_insert([value, value]);
         *min = min.min(value);
         *max = max.max(value);
-    }
-
-    fn cube(&mut self, origin: [i32; 3], log2_voxels: u32) {
-        grow(&mut self.bbox, origin, origin.map(|c| c.wrapping_add((1 << log2_voxels) - 1)));
-    }
-
-    /// Takes in the active tiles of a node and counts them.
-    fn tiles(&mut self, node: &InternalNode, level: Level) -> u64 {
-        let mut count = 0;
-        for slot in node.value_mask.iter().filter(|slot| !node.child_mask.contains(*slot)) {
-            count += 1;
-            self.value(node.tiles.value(slot));
-            self.cube(level.child_origin(node.origin, slot), level.log2_child_voxels);
-        }
-        count
-    }
-
-    fn leaf(&mut self, origin: [i32; 3], mask: &[u64; 8], values: &[f32; LEAF_VOXELS]) {
-        for (x, word) in mask.iter().enumerate() {
-            bits(*word).for_each(|bit| self.value(values[x * 64 + bit]));
-        }
-        grow_to_leaf(&mut self.bbox, origin, mask);
     }
 }
 

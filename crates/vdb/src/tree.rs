@@ -179,6 +179,22 @@ impl Tree {
         }
     }
 
+    /// The memory that the tree's vectors hold, in bytes.
+    pub fn memory_bytes(&self) -> u64 {
+        let node = |node: &InternalNode| {
+            let mask_words = node.child_mask.words().len() + node.value_mask.words().len();
+            let tiles = match &node.tiles {
+                Tiles::Uniform(_) => 0,
+                Tiles::PerSlot(values) => size_of_val(&**values),
+            };
+            size_of_val(node) + mask_words * Mask::BYTES_PER_WORD + tiles
+        };
+        let nodes: usize = self.nodes5.iter().chain(&self.nodes4).map(node).sum();
+        let Leaves { origins, masks, values } = &self.leaves;
+        let leaves = size_of_val(&**origins) + size_of_val(&**masks) + size_of_val(&**values);
+        (size_of_val(&*self.root_tiles) + nodes + leaves) as u64
+    }
+
     /// The leaves in OpenVDB's order: by root child, then by slot, then by slot.
     pub fn leaf_order(&self) -> impl Iterator<Item = usize> + '_ {
         self.nodes5.iter().flat_map(|node5| node5.children()).flat_map(|i| self.nodes4[i].children())

@@ -5,7 +5,10 @@
 
 use glam::{IVec3, Vec3};
 
-use crate::space::{LOG2_NODE4_BRICKS, NODE5_SLOTS, brick_of, node5_slot, root_cell, voxel_offset};
+use crate::brick::Bounds;
+use crate::space::{
+    LOG2_NODE4_BRICKS, NODE4_SLOTS, NODE5_SLOTS, brick_of, node4_slot, node5_slot, root_cell, voxel_offset,
+};
 use crate::tree::{Content, Entry, Region, Tree};
 
 /// A reader of a [`Tree`] that remembers where it was.
@@ -42,6 +45,22 @@ impl<'a> Accessor<'a> {
         self.region_from_node5(brick)
     }
 
+    /// The extent of the region around a brick (as [`Region::log2_bricks`]) and its footprint: all that a walk
+    /// through empty space needs.
+    #[inline]
+    pub fn footprint(&mut self, brick: IVec3) -> (u32, Bounds) {
+        if let Some((key, node4)) = self.node4
+            && key == brick >> LOG2_NODE4_BRICKS
+        {
+            let nodes = &self.tree.node4;
+            let entry = nodes.entry_index(node4, NODE4_SLOTS, node4_slot(brick));
+            return (0, entry.map_or(Bounds::of(0.0), |entry| nodes.footprints[entry]));
+        }
+        let region = self.region_from_node5(brick);
+        (region.log2_bricks, region.footprint)
+    }
+
+    #[inline(never)]
     fn region_from_node5(&mut self, brick: IVec3) -> Region {
         let cell = root_cell(brick);
         if self.node5.is_none_or(|(key, _)| key != cell) {
@@ -68,7 +87,7 @@ impl<'a> Accessor<'a> {
             None => Region {
                 log2_bricks: LOG2_NODE4_BRICKS,
                 content: Content::Constant(0.0),
-                footprint: crate::brick::Bounds::of(0.0),
+                footprint: Bounds::of(0.0),
             },
         }
     }

@@ -46,6 +46,23 @@ impl Bricks {
         }
     }
 
+    /// The eight values from an offset on, a row along z if the offset is a multiple of eight.
+    ///
+    /// # Panics
+    /// If there is no such brick, or the offset is larger than 504.
+    #[inline]
+    pub fn row(&self, brick: u32, offset: usize, row: &mut [f32; 8]) {
+        let at = brick as usize * BRICK_VOXELS + offset;
+        match self {
+            Bricks::F32(values) => row.copy_from_slice(&values[at..at + 8]),
+            Bricks::F16(values) => {
+                for (to, from) in row.iter_mut().zip(&values[at..at + 8]) {
+                    *to = f32_from_finite_f16(*from);
+                }
+            }
+        }
+    }
+
     /// The values at an offset and at its seven neighbours towards +x, +y, +z, all in the same brick: corner
     /// `i` is `dx << 2 | dy << 1 | dz`.
     ///

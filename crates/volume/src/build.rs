@@ -17,8 +17,8 @@ use crate::tree::{Entry, MaskWord, Nodes, RootEntry, Tree};
 /// Why a tree cannot be built.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum BuildError {
-    /// More bricks or entries than 32-bit indices can name.
-    #[error("the volume needs {what}, more than {limit}")]
+    /// More of something than a limit allows, such as bricks or entries than 32-bit indices can name.
+    #[error("the volume needs more than {limit} {what}")]
     Limit {
         /// What there are too many of.
         what: &'static str,
@@ -45,14 +45,18 @@ pub enum TileSize {
 #[derive(Debug, Default)]
 pub struct TreeBuilder {
     root: BTreeMap<[i32; 3], Slot<Node5>>,
+    node4s: Vec<Node4>,
+    /// The `Node4` that was changed last and its first brick: bricks of one mostly come together.
+    last_node4: Option<(IVec3, usize)>,
     summaries: Vec<BrickSummary>,
 }
 
-type Node5 = BTreeMap<u16, Slot<Node4>>;
+/// A child is an index of [`TreeBuilder::node4s`].
+type Node5 = BTreeMap<u16, Slot<usize>>;
 type Node4 = Box<[Leaf]>;
 
 /// One value, or a child.
-#[derive(Debug)]
+#[derive(Debug, Clone, Copy)]
 enum Slot<T> {
     Tile(f32),
     Child(T),
@@ -65,6 +69,9 @@ enum Leaf {
     Tile(f32),
     Brick(u32),
 }
+
+/// A node and what stands beside it in one direction, by the bit set of the axes along which it lies.
+type Around<T> = [Option<Slot<T>>; 8];
 
 const ZERO: Bounds = Bounds { min: 0.0, max: 0.0 };
 /// Index coordinates have 32 bits, so brick coordinates lie in `-BRICK_END..BRICK_END`.
@@ -125,14 +132,26 @@ impl TreeBuilder {
 
     fn leaf(&mut self, brick: IVec3, leaf: Leaf) -> Result<(), BuildError> {
         let overlap = BuildError::Overlap(brick << 3);
-        let node5 = self.root.entry(root_cell(brick).to_array());
-        let Slot::Child(node5) = node5.or_insert_with(|| Slot::Child(Node5::new())) else {
-            return Err(overlap);
+        let first_brick = brick & !15;
+        let node4 = match self.last_node4 {
+            Some((last, node4)) if last == first_brick => node4,
+            _ => {
+                let node5 = self.root.entry(root_cell(brick).to_array());
+                let Slot::Child(node5) = node5.or_insert_with(|| Slot::Child(Node5::new())) else {
+                    return Err(overlap);
+                };
+                let node4s = &mut self.node4s;
+                let new_node4 = || {
+                    node4s.push(vec![Leaf::Absent; NODE4_SLOTS].into());
+                    Slot::Child(node4s.len() - 1)
+                };
+                let slot = node5.entry(node5_slot(brick) as u16).or_insert_with(new_node4);
+                let Slot::Child(node4) = *slot else { return Err(overlap) };
+                self.last_node4 = Some((first_brick, node4));
+                node4
+            }
         };
-        let node4 = node5.entry(node5_slot(brick) as u16);
-        let absent = || Slot::Child(vec![Leaf::Absent; NODE4_SLOTS].into());
-        let Slot::Child(node4) = node4.or_insert_with(absent) else { return Err(overlap) };
-        match std::mem::replace(&mut node4[node4_slot(brick)], leaf) {
+        match std::mem::replace(&mut self.node4s[node4][node4_slot(brick)], leaf) {
             Leaf::Absent => Ok(()),
             _ => Err(overlap),
         }
@@ -157,9 +176,13 @@ impl TreeBuilder {
         for (cell, slot) in &self.root {
             let cell = IVec3::from_array(*cell);
             let brick = cell << LOG2_NODE5_BRICKS;
+            let after = self.node5s_around(brick, 1);
             let (entry, footprint) = match slot {
-                Slot::Tile(value) => (Entry::constant(*value), self.footprint(brick, LOG2_NODE5_BRICKS)),
-                Slot::Child(node5) => self.flatten_node5(node5, brick, &mut tree)?,
+                Slot::Tile(value) => {
+                    let reach = |axes| self.node5_low_bounds(after[axes], axes);
+                    (Entry::constant(*value), union_of((0..8).map(reach)))
+                }
+                Slot::Child(node5) => self.flatten_node5(node5, &after, &mut tree)?,
             };
             tree.root.push(RootEntry { cell, entry, footprint });
         }
@@ -169,29 +192,34 @@ impl TreeBuilder {
     fn flatten_node5(
         &self,
         node5: &Node5,
-        first_brick: IVec3,
+        after: &Around<&Node5>,
         tree: &mut Tree,
     ) -> Result<(Entry, Bounds), BuildError> {
         let mut entries = Vec::with_capacity(node5.len());
         for (slot, content) in node5 {
-            let brick = node5_slot_brick(first_brick, usize::from(*slot));
+            let slot = usize::from(*slot);
+            let after = self.node4s_around(after, slot, 1);
             let (entry, footprint) = match content {
-                Slot::Tile(value) => (Entry::constant(*value), self.footprint(brick, LOG2_NODE4_BRICKS)),
-                Slot::Child(node4) => self.flatten_node4(node4, brick, &mut tree.node4)?,
+                Slot::Tile(value) => {
+                    let reach = |axes| self.node4_low_bounds(after[axes], axes);
+                    (Entry::constant(*value), union_of((0..8).map(reach)))
+                }
+                Slot::Child(node4) => self.flatten_node4(*node4, &after, &mut tree.node4)?,
             };
-            entries.push((usize::from(*slot), entry, footprint));
+            entries.push((slot, entry, footprint));
         }
         push_node(&mut tree.node5, NODE5_SLOTS, &entries)
     }
 
     fn flatten_node4(
         &self,
-        node4: &[Leaf],
-        first_brick: IVec3,
+        node4: usize,
+        after: &Around<&[Leaf]>,
         nodes: &mut Nodes,
     ) -> Result<(Entry, Bounds), BuildError> {
+        let after = Bordered::new(after, 1);
         let mut entries = Vec::new();
-        for (slot, leaf) in node4.iter().enumerate() {
+        for (slot, leaf) in self.node4s[node4].iter().enumerate() {
             let entry = match leaf {
                 Leaf::Absent => continue,
                 Leaf::Tile(value) => Entry::constant(*value),
@@ -200,94 +228,121 @@ impl TreeBuilder {
                     Entry { child: *index, min: all.min, max: all.max, mean }
                 }
             };
-            entries.push((slot, entry, self.footprint(node4_slot_brick(first_brick, slot), 0)));
+            let after = after.leaves(slot);
+            let footprint = match leaf {
+                // So are most of the many tiles that a cut region leaves.
+                Leaf::Tile(value) if after == [*leaf; 8] => Bounds::of(*value),
+                _ => union_of((0..8).map(|axes| self.leaf_low_bounds(after[axes], axes))),
+            };
+            entries.push((slot, entry, footprint));
         }
         push_node(nodes, NODE4_SLOTS, &entries)
     }
 
-    /// Bounds over the trilinear footprint of the region of that extent: the region and the layer of voxels
-    /// beyond it.
-    fn footprint(&self, brick: IVec3, log2_bricks: u32) -> Bounds {
-        let next = |axes| brick + (step(axes) << log2_bricks);
-        let reach = |axes| self.low_bounds(next(axes), log2_bricks, axes);
-        (0..8).map(reach).reduce(Bounds::union).unwrap_or(ZERO)
+    /// What stands in the cell of a brick and beside it, up or down.
+    fn node5s_around(&self, brick: IVec3, direction: i32) -> Around<&Node5> {
+        std::array::from_fn(|axes| {
+            let cell = root_cell(brick) + step(axes) * direction;
+            self.root.get(&cell.to_array()).map(|slot| match slot {
+                Slot::Tile(value) => Slot::Tile(*value),
+                Slot::Child(node5) => Slot::Child(node5),
+            })
+        })
     }
 
-    /// Bounds of the voxels at the low end, along some axes, of the region of that extent around a brick.
-    fn low_bounds(&self, brick: IVec3, log2_bricks: u32, axes: usize) -> Bounds {
-        match self.root.get(&root_cell(brick).to_array()) {
+    /// What stands in a slot of a `Node5` and beside it, up or down.
+    fn node4s_around(&self, node5s: &Around<&Node5>, slot: usize, direction: i32) -> Around<&[Leaf]> {
+        std::array::from_fn(|axes| {
+            let at = node5_slot_brick(IVec3::ZERO, slot) + ((step(axes) * direction) << LOG2_NODE4_BRICKS);
+            self.node4_in(node5s[outside(at, LOG2_NODE5_BRICKS)], node5_slot(at))
+        })
+    }
+
+    fn node4_in(&self, node5: Option<Slot<&Node5>>, slot: usize) -> Option<Slot<&[Leaf]>> {
+        match node5? {
+            Slot::Tile(value) => Some(Slot::Tile(value)),
+            Slot::Child(node5) => node5.get(&(slot as u16)).map(|slot| match slot {
+                Slot::Tile(value) => Slot::Tile(*value),
+                Slot::Child(node4) => Slot::Child(&*self.node4s[*node4]),
+            }),
+        }
+    }
+
+    /// Bounds of the voxels of a cell at its low end along some axes.
+    fn node5_low_bounds(&self, node5: Option<Slot<&Node5>>, axes: usize) -> Bounds {
+        match node5 {
             None => ZERO,
-            Some(Slot::Tile(value)) => Bounds::of(*value),
-            Some(Slot::Child(node5)) => {
-                let slot = (log2_bricks < LOG2_NODE5_BRICKS).then(|| node5_slot(brick));
-                let leaf = (log2_bricks == 0).then(|| node4_slot(brick));
-                slot_or_face(slot, LOG2_NODE5_BRICKS - LOG2_NODE4_BRICKS, axes, 0)
-                    .map(|slot| match node5.get(&(slot as u16)) {
-                        None => ZERO,
-                        Some(Slot::Tile(value)) => Bounds::of(*value),
-                        Some(Slot::Child(node4)) => self.low_bounds_in_node4(node4, leaf, axes),
-                    })
-                    .reduce(Bounds::union)
-                    .unwrap_or(ZERO)
+            Some(Slot::Tile(value)) => Bounds::of(value),
+            Some(Slot::Child(_)) => {
+                let slots = face_slots(LOG2_NODE5_BRICKS - LOG2_NODE4_BRICKS, axes, 0);
+                union_of(slots.map(|slot| self.node4_low_bounds(self.node4_in(node5, slot), axes)))
             }
         }
     }
 
-    /// The same in one slot of a `Node4`, or in all at its low end.
-    fn low_bounds_in_node4(&self, node4: &Node4, slot: Option<usize>, axes: usize) -> Bounds {
-        slot_or_face(slot, LOG2_NODE4_BRICKS, axes, 0)
-            .map(|slot| match node4[slot] {
-                Leaf::Absent => ZERO,
-                Leaf::Tile(value) => Bounds::of(value),
-                Leaf::Brick(index) => self.summaries[index as usize].low_bounds[axes],
-            })
-            .reduce(Bounds::union)
-            .unwrap_or(ZERO)
+    /// The same of a slot of a `Node5`.
+    fn node4_low_bounds(&self, node4: Option<Slot<&[Leaf]>>, axes: usize) -> Bounds {
+        match node4 {
+            None => ZERO,
+            Some(Slot::Tile(value)) => Bounds::of(value),
+            Some(Slot::Child(node4)) => {
+                let slots = face_slots(LOG2_NODE4_BRICKS, axes, 0);
+                union_of(slots.map(|slot| self.leaf_low_bounds(node4[slot], axes)))
+            }
+        }
+    }
+
+    /// The same of a slot of a `Node4`.
+    fn leaf_low_bounds(&self, leaf: Leaf, axes: usize) -> Bounds {
+        match leaf {
+            Leaf::Absent => ZERO,
+            Leaf::Tile(value) => Bounds::of(value),
+            Leaf::Brick(index) => self.summaries[index as usize].low_bounds[axes],
+        }
     }
 
     /// The places before stored regions, along the axes of a bit set, that see values there that are not
-    /// zero: first brick, extent, axes. Those already taken by a neighbour in the same node are left out.
+    /// zero: first brick, extent, axes. Those of the same extent at which something is stored are left out.
     fn regions_before_others(&self) -> Vec<(IVec3, u32, usize)> {
         let mut found = Vec::new();
-        let mut look = |brick: IVec3, log2_bricks: u32, low: &dyn Fn(usize) -> Bounds| {
-            for axes in (1..8).filter(|axes| low(*axes) != ZERO) {
-                let before = brick - (step(axes) << log2_bricks);
-                if before.min_element() >= -BRICK_END {
-                    found.push((before, log2_bricks, axes));
-                }
+        let mut add = |brick: IVec3, log2_bricks: u32, axes: usize| {
+            let before = brick - (step(axes) << log2_bricks);
+            if before.min_element() >= -BRICK_END {
+                found.push((before, log2_bricks, axes));
             }
         };
         for (cell, slot) in &self.root {
             let first_brick = IVec3::from_array(*cell) << LOG2_NODE5_BRICKS;
             let node5 = match slot {
                 Slot::Tile(value) => {
-                    look(first_brick, LOG2_NODE5_BRICKS, &|_| Bounds::of(*value));
+                    if *value != 0.0 {
+                        (1..8).for_each(|axes| add(first_brick, LOG2_NODE5_BRICKS, axes));
+                    }
                     continue;
                 }
                 Slot::Child(node5) => node5,
             };
+            let before = self.node5s_around(first_brick, -1);
             for (slot, content) in node5 {
-                let first_brick = node5_slot_brick(first_brick, usize::from(*slot));
+                let slot = usize::from(*slot);
+                let first_brick = node5_slot_brick(first_brick, slot);
+                let before = self.node4s_around(&before, slot, -1);
                 let node4 = match content {
                     Slot::Tile(value) => {
-                        look(first_brick, LOG2_NODE4_BRICKS, &|_| Bounds::of(*value));
+                        let open = |axes: &usize| !matches!(before[*axes], Some(Slot::Tile(_)));
+                        if *value != 0.0 {
+                            (1..8).filter(open).for_each(|axes| add(first_brick, LOG2_NODE4_BRICKS, axes));
+                        }
                         continue;
                     }
-                    Slot::Child(node4) => node4,
+                    Slot::Child(node4) => &self.node4s[*node4],
                 };
-                for (slot, leaf) in node4.iter().enumerate() {
-                    let brick = node4_slot_brick(first_brick, slot);
-                    let taken = |axes: usize| {
-                        let before = brick - step(axes);
-                        before & !15 == first_brick && node4[node4_slot(before)] != Leaf::Absent
-                    };
-                    let unless_taken = |axes: usize, bounds: Bounds| if taken(axes) { ZERO } else { bounds };
-                    match leaf {
-                        Leaf::Absent => {}
-                        Leaf::Tile(value) => look(brick, 0, &|axes| unless_taken(axes, Bounds::of(*value))),
-                        Leaf::Brick(i) => {
-                            let low = self.summaries[*i as usize].low_bounds;
-                            look(brick, 0, &|axes| unless_taken(axes, low[axes]));
+                let before = Bordered::new(&before, -1);
+                for (slot, leaf) in node4.iter().enumerate().filter(|(_, leaf)| **leaf != Leaf::Absent) {
+                    let before = before.leaves(slot);
+                    for axes in (1..8).filter(|axes| before[*axes] == Leaf::Absent) {
+                        if self.leaf_low_bounds(*leaf, axes) != ZERO {
+                            add(node4_slot_brick(first_brick, slot), 0, axes);
                         }
                     }
                 }
@@ -304,6 +359,7 @@ impl TreeBuilder {
         let slot = (log2_bricks < LOG2_NODE5_BRICKS).then(|| node5_slot(brick));
         for slot in slot_or_face(slot, LOG2_NODE5_BRICKS - LOG2_NODE4_BRICKS, axes, 31) {
             let Slot::Child(node4) = node5.entry(slot as u16).or_insert(Slot::Tile(0.0)) else { continue };
+            let node4 = &mut self.node4s[*node4];
             let slot = (log2_bricks == 0).then(|| node4_slot(brick));
             for slot in slot_or_face(slot, LOG2_NODE4_BRICKS, axes, 15) {
                 if node4[slot] == Leaf::Absent {
@@ -312,6 +368,50 @@ impl TreeBuilder {
             }
         }
     }
+}
+
+/// The axes along which a brick coordinate lies one step outside of `0..1 << log2_bricks`, up or down.
+fn outside(brick: IVec3, log2_bricks: u32) -> usize {
+    let beyond = (brick >> log2_bricks) & 1;
+    (beyond.x << 2 | beyond.y << 1 | beyond.z) as usize
+}
+
+/// The slots of a `Node4` with one layer of what stands beside it, up or down.
+struct Bordered {
+    /// 17³ of them.
+    leaves: Vec<Leaf>,
+    direction: i32,
+}
+
+impl Bordered {
+    fn new(around: &Around<&[Leaf]>, direction: i32) -> Self {
+        let coordinates = direction.min(0)..16 + direction.max(0);
+        let mut leaves = Vec::with_capacity(17 * 17 * 17);
+        for x in coordinates.clone() {
+            for y in coordinates.clone() {
+                for z in coordinates.clone() {
+                    let at = IVec3::new(x, y, z);
+                    leaves.push(match around[outside(at, LOG2_NODE4_BRICKS)] {
+                        None => Leaf::Absent,
+                        Some(Slot::Tile(value)) => Leaf::Tile(value),
+                        Some(Slot::Child(node4)) => node4[node4_slot(at)],
+                    });
+                }
+            }
+        }
+        Bordered { leaves, direction }
+    }
+
+    /// What stands in a slot and one step from it, by the bit set of the axes of the step.
+    fn leaves(&self, slot: usize) -> [Leaf; 8] {
+        let index = |at: IVec3| (at.x * 17 + at.y) * 17 + at.z;
+        let here = index(node4_slot_brick(IVec3::splat(-self.direction.min(0)), slot));
+        std::array::from_fn(|axes| self.leaves[(here + self.direction * index(step(axes))) as usize])
+    }
+}
+
+fn union_of(bounds: impl Iterator<Item = Bounds>) -> Bounds {
+    bounds.reduce(Bounds::union).unwrap_or(ZERO)
 }
 
 /// One slot, or without one those of [`face_slots`].
