@@ -48,6 +48,8 @@ def nuage_command(run, output):
         "--sky", "0,0,0", "--background", "0,0,0",
         "--density", str(EXTINCTION_PER_WORLD_UNIT), "--albedo", numbers([ALBEDO] * 3), "--phase", "0",
         "--step", str(PRIMARY_STEP_VOXELS), "--shadow-step", str(SHADOW_STEP_VOXELS), "--samples", "1",
+        # The same share of light at which the peer ends a ray, and a shadow ray for each step as it has.
+        "--cutoff", f"{math.sqrt(run.cutoff / 3):.6f}", "--sun-rays", str(run.sun_rays),
         "--threads", str(run.threads),
     ]  # fmt: skip
 
@@ -288,6 +290,12 @@ def arguments():
         type=float,
         default=0.005,
         help="vdb_render's -cutoff (default: 0.005, its own: rays end at a transmittance of 0.04)",
+    )
+    parser.add_argument(
+        "--sun-rays",
+        type=int,
+        default=1_000_000,
+        help="nuage's --sun-rays (default: one shadow ray per step, as the peer; 24 is nuage's own default)",
     )
     parser.add_argument("--out", type=Path, default=ROOT / "out/bench", help="folder for the pictures")
     run = parser.parse_args()

@@ -23,11 +23,11 @@ use nuage_volume::space::BRICK_VOXELS;
 /// The most root cells (4096³ voxels each) that a background other than zero may fill.
 const MAX_BACKGROUND_CELLS: i64 = 4096;
 
-/// The most regions of 128³ voxels of one value that the active box may cut: each becomes up to 4096 tiles. About
-/// 300 MB and a second; a box of 2000³ voxels full of background takes 1500.
-const MAX_CUT_REGIONS: u64 = 2048;
-/// A region of 4096³ counts for as many: it becomes up to 32768 tiles, each of which costs more.
-const CUT_REGIONS_PER_NODE5: u64 = 32;
+/// The most regions of 128³ voxels of one value that the active box may cut: each becomes up to 4096 tiles. That
+/// takes up to about half a gigabyte; a box of 2000³ voxels full of background takes 1500.
+const MAX_CUT_REGIONS: u64 = 1 << 12;
+/// A region of 4096³ counts for as many: it becomes up to 32768 tiles, each of which takes longer.
+const CUT_REGIONS_PER_NODE5: u64 = 64;
 
 /// Why a grid cannot become a channel.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -319,8 +319,7 @@ impl Importer {
             self.report.level_set_band = Some(band);
         }
         let mut kept = Vec::with_capacity(found.len());
-        let mut exact_in_half =
-            may_be_half && self.tile_bricks.iter().all(|v| f16::from_f32(*v).to_f32() == *v);
+        let mut exact_in_half = may_be_half && self.tile_bricks.iter().all(|v| is_exact_in_half(*v));
         for (i, leaf) in found.iter().enumerate() {
             self.report.nan_values += u64::from(leaf.nan);
             self.report.negative_values += u64::from(leaf.negative);
@@ -400,13 +399,9 @@ fn convert_leaf(
             *value = meaning.density(*value);
         }
     }
-    let exact_in_half = may_be_half && {
-        let mut halves = [f16::ZERO; BRICK_VOXELS];
-        let mut back = [0.0; BRICK_VOXELS];
-        halves.convert_from_f32_slice(values);
-        halves.convert_to_f32_slice(&mut back);
-        back == *values
-    };
+    // Without a branch in the loop, so that it becomes vector instructions.
+    let all_exact = || values.iter().fold(true, |all, value| all & is_exact_in_half(*value));
+    let exact_in_half = may_be_half && all_exact();
     Leaf { summary: BrickSummary::of(values), nan, negative, infinite, exact_in_half }
 }
 
@@ -419,6 +414,15 @@ fn clear_outside(values: &mut [f32; BRICK_VOXELS], min: IVec3, max: IVec3) {
             *value = 0.0;
         }
     }
+}
+
+/// Whether a half float holds a density exactly: a multiple of the smallest one, 2⁻²⁴, with at most eleven
+/// significant bits, below 65536.
+fn is_exact_in_half(density: f32) -> bool {
+    // Numbers from ½ to 1 are the multiples of 2⁻²⁴ there, so the sum is rounded to one.
+    let is_multiple = (density + 0.5) - 0.5 == density;
+    let is_short = density.to_bits() & 0x1fff == 0;
+    is_multiple & is_short & (density < 65536.0)
 }
 
 fn to_half_bits(from: &[f32], to: &mut [u16]) {
@@ -456,4 +460,26 @@ fn copy_kept<T: Send>(values: &[f32], kept: &[usize], to: &mut [T], copy: impl F
     }
     #[cfg(not(feature = "parallel"))]
     to.chunks_exact_mut(BRICK_VOXELS).zip(kept).for_each(copy);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn exactly_what_a_half_float_holds_is_exact_in_half() {
+        for bits in 0..=f16::MAX.to_bits() {
+            let value = f16::from_bits(bits).to_f32();
+            assert!(is_exact_in_half(value), "{value}");
+            // Values around it: the next floats, and those with each of the bits that a half float lacks.
+            let near =
+                (0..14).flat_map(|i| [value.to_bits() + (1 << i), value.to_bits().saturating_sub(1 << i)]);
+            for near in near.map(f32::from_bits) {
+                assert_eq!(is_exact_in_half(near), f16::from_f32(near).to_f32() == near, "{near}");
+            }
+        }
+        for large in [65520.0, 65536.0, 131072.0, f32::MAX] {
+            assert!(!is_exact_in_half(large), "{large}");
+        }
+    }
 }

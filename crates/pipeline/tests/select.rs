@@ -50,6 +50,18 @@ fn without_a_name_density_is_drawn_else_a_fog_else_a_level_set_else_any_float_gr
 }
 
 #[test]
+fn a_namesake_that_cannot_be_drawn_does_not_hide_one_that_can() {
+    let Some(mut file) = open("data/edge/types_bloscmask.vdb") else { return };
+    file.grids.retain(|grid| grid.name == "bool" || grid.name == "float");
+    file.grids.sort_by_key(|grid| grid.is_readable());
+    for (number, grid) in file.grids.iter_mut().enumerate() {
+        grid.name = "density".to_owned();
+        grid.unique_name = format!("density[{number}]");
+    }
+    assert_eq!(density_name(&file), "density[1]");
+}
+
+#[test]
 fn the_choice_is_the_best_there_is_in_every_file_with_truth() {
     let rank = |grid: &nuage_vdb::GridInfo| match (grid.name.as_str(), grid.grid_class()) {
         ("density", _) => 0,

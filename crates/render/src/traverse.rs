@@ -181,8 +181,8 @@ impl<'a> Field<'a> {
             t_brick: (8.0 * ray.inverse).abs(),
             sign: IVec3::select(forward, IVec3::ONE, IVec3::NEG_ONE),
             brick_end: IVec3::select(forward, self.brick_box[1] + 1, self.brick_box[0] - 1),
-            tile_parts: [None; 3],
-            held: None,
+            waiting: [Run { t0, t1, kind: RunKind::Varying }; 3],
+            waiting_count: 0,
         };
         runs.aim();
         runs
@@ -239,44 +239,12 @@ pub struct Runs<'r, 'a> {
     /// The step to the next brick along each axis, and the first brick outside in that direction.
     sign: IVec3,
     brick_end: IVec3,
-    /// What is left of a large tile, last part first.
-    tile_parts: [Option<Run>; 3],
-    /// A varying run that may go on.
-    held: Option<Run>,
+    /// Runs found and not yet given out, the last one first.
+    waiting: [Run; 3],
+    waiting_count: usize,
 }
 
 impl Runs<'_, '_> {
-    /// The next stretch that is not empty, one region at a time.
-    fn next_stretch(&mut self) -> Option<Run> {
-        if let Some(run) = self.next_of_tile() {
-            return Some(run);
-        }
-        while self.t < self.t_end {
-            let (log2_bricks, footprint) = self.accessor.footprint(self.brick);
-            let (t0, brick) = (self.t, self.brick);
-            if log2_bricks == 0 {
-                self.step_brick();
-            } else {
-                self.leap(log2_bricks);
-            }
-            let t1 = self.t.min(self.t_end);
-            if (footprint.max == 0.0 && footprint.min == 0.0) || t0 >= t1 {
-                continue;
-            }
-            if footprint.is_constant() {
-                return Some(Run { t0, t1, kind: RunKind::Constant(footprint.max) });
-            }
-            if log2_bricks == 0 {
-                return Some(Run { t0, t1, kind: RunKind::Varying });
-            }
-            self.split_tile(brick, t0, t1);
-            if let Some(run) = self.next_of_tile() {
-                return Some(run);
-            }
-        }
-        None
-    }
-
     /// Moves on to the next brick.
     #[inline]
     fn step_brick(&mut self) {
@@ -335,12 +303,6 @@ impl Runs<'_, '_> {
         Vec3::select(self.ray.direction.cmpeq(Vec3::ZERO), Vec3::INFINITY, t)
     }
 
-    /// The next part of a tile that was cut.
-    #[inline]
-    fn next_of_tile(&mut self) -> Option<Run> {
-        self.tile_parts.iter_mut().rev().find_map(Option::take)
-    }
-
     /// Cuts the stretch of a large tile at its homogeneous part.
     fn split_tile(&mut self, brick: IVec3, t0: f32, t1: f32) {
         let region = self.accessor.region(brick);
@@ -356,9 +318,17 @@ impl Runs<'_, '_> {
         let (a, b) = if a < b { (a.clamp(t0, t1), b.clamp(t0, t1)) } else { (t1, t1) };
         let layer = |t0, t1| Run { t0, t1, kind: RunKind::Varying };
         let core = Run { t0: a, t1: b, kind: RunKind::Constant(value) };
-        let parts = [layer(b, t1), core, layer(t0, a)];
-        self.tile_parts =
-            parts.map(|run| (run.t0 < run.t1 && run.kind != RunKind::Constant(0.0)).then_some(run));
+        for run in [layer(b, t1), core, layer(t0, a)] {
+            if run.t0 < run.t1 && run.kind != RunKind::Constant(0.0) {
+                self.wait(run);
+            }
+        }
+    }
+
+    /// Keeps a run until those before it are given out.
+    fn wait(&mut self, run: Run) {
+        self.waiting[self.waiting_count] = run;
+        self.waiting_count += 1;
     }
 }
 
@@ -372,19 +342,46 @@ fn extent(brick: IVec3, log2_bricks: u32) -> (IVec3, IVec3) {
 impl Iterator for Runs<'_, '_> {
     type Item = Run;
 
-    /// Varying stretches that touch come as one run.
-    #[inline]
+    /// Varying bricks that touch come as one run.
     fn next(&mut self) -> Option<Run> {
-        let mut run = self.held.take().or_else(|| self.next_stretch())?;
-        if run.kind == RunKind::Varying {
-            while let Some(next) = self.next_stretch() {
-                if next.kind != RunKind::Varying || next.t0 != run.t1 {
-                    self.held = Some(next);
-                    break;
+        if self.waiting_count > 0 {
+            self.waiting_count -= 1;
+            return Some(self.waiting[self.waiting_count]);
+        }
+        let mut varying: Option<Run> = None;
+        while self.t < self.t_end {
+            let (log2_bricks, footprint) = self.accessor.footprint(self.brick);
+            let (t0, brick) = (self.t, self.brick);
+            if log2_bricks == 0 {
+                self.step_brick();
+            } else {
+                self.leap(log2_bricks);
+            }
+            let t1 = self.t.min(self.t_end);
+            if t0 >= t1 {
+                continue;
+            }
+            if footprint.is_constant() {
+                if footprint.max == 0.0 {
+                    if varying.is_some() {
+                        break;
+                    }
+                    continue;
                 }
-                run.t1 = next.t1;
+                self.wait(Run { t0, t1, kind: RunKind::Constant(footprint.max) });
+            } else if log2_bricks == 0 {
+                varying = Some(Run { t0: varying.map_or(t0, |run| run.t0), t1, kind: RunKind::Varying });
+                continue;
+            } else {
+                self.split_tile(brick, t0, t1);
+            }
+            if varying.is_some() || self.waiting_count > 0 {
+                break;
             }
         }
-        Some(run)
+        varying.or_else(|| {
+            self.waiting_count = self.waiting_count.checked_sub(1)?;
+            Some(self.waiting[self.waiting_count])
+        })
     }
 }

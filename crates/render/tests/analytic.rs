@@ -27,7 +27,13 @@ fn scaled() -> DAffine3 {
 }
 
 fn with_step(step_voxels: f32) -> Quality {
-    Quality { step_voxels, shadow_step_voxels: step_voxels, sun_rays: u32::MAX, sky_rays: 0, ..Quality::default() }
+    Quality {
+        step_voxels,
+        shadow_step_voxels: step_voxels,
+        sun_rays: u32::MAX,
+        sky_rays: 0,
+        ..Quality::default()
+    }
 }
 
 fn radiance(scene: &Scene<'_>, quality: Quality, ray: &Ray) -> Radiance {

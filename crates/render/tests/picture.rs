@@ -115,8 +115,13 @@ fn single_scattering_stays_below_the_furnace() {
 #[test]
 fn the_same_field_on_another_grid_gives_the_same_picture() {
     let (density, emission) = (density(), density());
-    let quality =
-        Quality { step_voxels: 0.25, shadow_step_voxels: 0.25, sun_rays: u32::MAX, sky_rays: 0, ..Quality::default() };
+    let quality = Quality {
+        step_voxels: 0.25,
+        shadow_step_voxels: 0.25,
+        sun_rays: u32::MAX,
+        sky_rays: 0,
+        ..Quality::default()
+    };
     let reference = picture(&scene(&density, Some(&emission)), quality);
     assert!(reference.mean()[3] > 0.03, "{:?}", reference.mean());
 

@@ -4,6 +4,7 @@
 //! every footprint, and flattens the maps into the arrays of [`Tree`].
 
 use std::collections::BTreeMap;
+use std::iter::repeat_n;
 
 use glam::IVec3;
 
@@ -385,17 +386,19 @@ struct Bordered {
 
 impl Bordered {
     fn new(around: &Around<&[Leaf]>, direction: i32) -> Self {
-        let coordinates = direction.min(0)..16 + direction.max(0);
+        // Along z a run of slots stands together, and the border is one more.
+        let runs = if direction < 0 { [-1..0, 0..16] } else { [0..16, 16..17] };
         let mut leaves = Vec::with_capacity(17 * 17 * 17);
-        for x in coordinates.clone() {
-            for y in coordinates.clone() {
-                for z in coordinates.clone() {
-                    let at = IVec3::new(x, y, z);
-                    leaves.push(match around[outside(at, LOG2_NODE4_BRICKS)] {
-                        None => Leaf::Absent,
-                        Some(Slot::Tile(value)) => Leaf::Tile(value),
-                        Some(Slot::Child(node4)) => node4[node4_slot(at)],
-                    });
+        for x in runs[0].start..runs[1].end {
+            for y in runs[0].start..runs[1].end {
+                for run in &runs {
+                    let at = IVec3::new(x, y, run.start);
+                    let (slot, len) = (node4_slot(at), run.len());
+                    match around[outside(at, LOG2_NODE4_BRICKS)] {
+                        None => leaves.extend(repeat_n(Leaf::Absent, len)),
+                        Some(Slot::Tile(value)) => leaves.extend(repeat_n(Leaf::Tile(value), len)),
+                        Some(Slot::Child(node4)) => leaves.extend_from_slice(&node4[slot..slot + len]),
+                    }
                 }
             }
         }
