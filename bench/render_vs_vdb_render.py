@@ -295,7 +295,7 @@ def arguments():
         "--sun-rays",
         type=int,
         default=1_000_000,
-        help="nuage's --sun-rays (default: one shadow ray per step, as the peer; 24 is nuage's own default)",
+        help="nuage's --sun-rays (default: one shadow ray per step, as the peer; 16 is nuage's own default)",
     )
     parser.add_argument("--out", type=Path, default=ROOT / "out/bench", help="folder for the pictures")
     run = parser.parse_args()

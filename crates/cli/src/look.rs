@@ -96,11 +96,11 @@ pub(crate) struct Look {
     pub(crate) step: f32,
 
     /// Length of a step of a shadow ray in voxels
-    #[arg(long, default_value = "1", value_parser = positive, value_name = "VOXELS", help_heading = "Quality")]
+    #[arg(long, default_value = "2", value_parser = positive, value_name = "VOXELS", help_heading = "Quality")]
     pub(crate) shadow_step: f32,
 
     /// Camera rays per pixel
-    #[arg(long, default_value = "4", value_parser = clap::value_parser!(u32).range(1..=65536), value_name = "N", help_heading = "Quality")]
+    #[arg(long, default_value = "1", value_parser = clap::value_parser!(u32).range(1..=65536), value_name = "N", help_heading = "Quality")]
     pub(crate) samples: u32,
 
     /// A ray ends where less than this share of the light passes
@@ -108,7 +108,7 @@ pub(crate) struct Look {
     pub(crate) cutoff: f32,
 
     /// Shadow rays towards the sun per camera ray that is scattered whole; a large number means one per step
-    #[arg(long, default_value = "24", value_parser = clap::value_parser!(u32).range(1..=1_000_000), value_name = "N", help_heading = "Quality")]
+    #[arg(long, default_value = "16", value_parser = clap::value_parser!(u32).range(1..=1_000_000), value_name = "N", help_heading = "Quality")]
     pub(crate) sun_rays: u32,
 
     /// Shadow rays towards the sky per camera ray that is scattered whole

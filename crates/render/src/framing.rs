@@ -16,7 +16,7 @@ const TARGET_LUMINANCE: f32 = 1.0;
 /// Rays per side of the grid that probes the volume.
 const PROBES: u32 = 32;
 /// Room around the volume in the picture.
-const MARGIN: f64 = 1.06;
+const MARGIN: f64 = 1.0;
 
 /// A box in world space.
 #[derive(Debug, Clone, Copy, PartialEq)]

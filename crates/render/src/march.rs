@@ -30,11 +30,11 @@ const LIT_PIECE_DEPTH: f32 = 0.25;
 /// … or after this many voxels, whichever is shorter.
 const LIT_PIECE_VOXELS: f32 = 8.0;
 /// A group of steps that share a ray to the sun is no longer than this, …
-const GROUP_VOXELS: f32 = 4.0;
+const GROUP_VOXELS: f32 = 8.0;
 /// … unless it scatters less than this part of a full group; then …
 const FAINT_GROUP: f32 = 0.1;
 /// … this is its end.
-const FAINT_GROUP_VOXELS: f32 = 16.0;
+const FAINT_GROUP_VOXELS: f32 = 32.0;
 
 /// How finely a picture is computed.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -58,9 +58,9 @@ impl Default for Quality {
     fn default() -> Self {
         Quality {
             step_voxels: 0.5,
-            shadow_step_voxels: 1.0,
+            shadow_step_voxels: 2.0,
             min_transmittance: 3e-4,
-            sun_rays: 24,
+            sun_rays: 16,
             sky_rays: 8,
             samples: 1,
         }

@@ -139,10 +139,10 @@ fn check(channel: &Channel, ray: &Ray) -> usize {
         assert!(outside >= start && outside <= end || outside < 0.0 || found < 1e-3, "{found} at {outside}");
     }
 
-    let mut accessor = field.accessor();
+    let mut reader = field.reader();
     let length = (end - start) as f32;
     let runs: Vec<Run> =
-        field.runs(&mut accessor, field.local(ray, start), 0.0, length).take(MAX_RUNS).collect();
+        field.runs(&mut reader.walker, field.local(ray, start), 0.0, length).take(MAX_RUNS).collect();
     assert!(runs.len() < MAX_RUNS, "a walk without end");
     let mut last = 0.0;
     for run in &runs {
@@ -260,11 +260,11 @@ fn the_ends_of_index_space_are_safe() {
                 let (origin, direction) = random_ray(&mut random, IndexBox { min, max });
                 let ray = Ray { origin, direction };
                 let Some([start, end]) = field.interval(&ray) else { continue };
-                let mut accessor = field.accessor();
-                let mut sampler = field.accessor();
+                let mut reader = field.reader();
+
                 let local = field.local(&ray, start);
-                for run in field.runs(&mut accessor, local, 0.0, (end - start) as f32).take(MAX_RUNS) {
-                    assert!(field.sample(&mut sampler, local.at(run.t0)).is_finite());
+                for run in field.runs(&mut reader.walker, local, 0.0, (end - start) as f32).take(MAX_RUNS) {
+                    assert!(field.sample(&mut reader.blocks, local.at(run.t0)).is_finite());
                 }
             }
         }
@@ -302,5 +302,34 @@ fn optical_depth_follows_the_voxels() {
                 );
             }
         }
+    }
+}
+
+/// Blocks hold what the accessor reads: bricks, tiles, empty space and all borders between them.
+#[test]
+fn blocks_return_what_the_accessor_returns() {
+    let mut random = Random(4711);
+    for half_extent in [40, 9000] {
+        let channel = random_channel(&mut random, IVec3::ZERO, false, DAffine3::IDENTITY);
+        let mut blocks = nuage_render::blocks::Blocks::new(&channel.tree);
+        let mut accessor = nuage_volume::accessor::Accessor::new(&channel.tree);
+        let index = channel.active_box.expect("a box");
+        let mut not_zero = 0;
+        for i in 0..20_000 {
+            // Near the content first, then so far around that slots are used again and again.
+            let unit = DVec3::new(random.unit(), random.unit(), random.unit());
+            let (low, high) = (index.min.as_dvec3() - 20.0, index.max.as_dvec3() + 20.0);
+            let p =
+                if i % 2 == 0 { low + (high - low) * unit } else { (unit - 0.5) * f64::from(half_extent) };
+            let (cell, fraction) = (p.floor().as_ivec3(), (p - p.floor()).as_vec3());
+            let want = accessor.trilinear_in_cell(cell, fraction);
+            let got = blocks.trilinear_in_cell(cell, fraction);
+            assert!(
+                (got - want).abs() <= 1e-6 * want.abs().max(1.0),
+                "{got}, not {want}, in {cell} at {fraction}"
+            );
+            not_zero += usize::from(want != 0.0);
+        }
+        assert!(not_zero > 100, "{not_zero} points with a value");
     }
 }
