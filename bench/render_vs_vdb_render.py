@@ -49,7 +49,7 @@ def nuage_command(run, output):
         "--density", str(EXTINCTION_PER_WORLD_UNIT), "--albedo", numbers([ALBEDO] * 3), "--phase", "0",
         "--step", str(PRIMARY_STEP_VOXELS), "--shadow-step", str(SHADOW_STEP_VOXELS), "--samples", "1",
         # The same share of light at which the peer ends a ray, and a shadow ray for each step as it has.
-        "--cutoff", f"{math.sqrt(run.cutoff / 3):.6f}", "--sun-rays", str(run.sun_rays),
+        "--cutoff", f"{math.sqrt(run.cutoff / 3):.6f}", "--sun-rays", str(run.sun_rays), "--shadow-growth", "0",
         "--threads", str(run.threads),
     ]  # fmt: skip
 

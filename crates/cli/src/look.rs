@@ -95,9 +95,13 @@ pub(crate) struct Look {
     #[arg(long, default_value = "0.5", value_parser = positive, value_name = "VOXELS", help_heading = "Quality")]
     pub(crate) step: f32,
 
-    /// Length of a step of a shadow ray in voxels
+    /// Length of the first step of a shadow ray in voxels
     #[arg(long, default_value = "2", value_parser = positive, value_name = "VOXELS", help_heading = "Quality")]
     pub(crate) shadow_step: f32,
+
+    /// Each step of a shadow ray is longer than the one before by this part of the first; 0 keeps them equal
+    #[arg(long, default_value = "0.05", value_parser = not_negative, value_name = "PART", help_heading = "Quality")]
+    pub(crate) shadow_growth: f32,
 
     /// Camera rays per pixel
     #[arg(long, default_value = "1", value_parser = clap::value_parser!(u32).range(1..=65536), value_name = "N", help_heading = "Quality")]
@@ -114,6 +118,13 @@ pub(crate) struct Look {
     /// Shadow rays towards the sky per camera ray that is scattered whole
     #[arg(long, default_value = "8", value_parser = clap::value_parser!(u32).range(1..=65536), value_name = "N", help_heading = "Quality")]
     pub(crate) sky_rays: u32,
+}
+
+fn not_negative(text: &str) -> Result<f32, String> {
+    match finite(text)? {
+        x if x >= 0.0 => Ok(x),
+        _ => Err("a number that is not negative is needed".into()),
+    }
 }
 
 fn share(text: &str) -> Result<f32, String> {

@@ -196,6 +196,7 @@ impl<'l> Shot<'l> {
         let quality = Quality {
             step_voxels: look.step,
             shadow_step_voxels: look.shadow_step,
+            shadow_growth: look.shadow_growth,
             min_transmittance: look.cutoff,
             sun_rays: look.sun_rays,
             sky_rays: look.sky_rays,

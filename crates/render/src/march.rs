@@ -41,8 +41,11 @@ const FAINT_GROUP_VOXELS: f32 = 32.0;
 pub struct Quality {
     /// The length of a step of a camera ray, in voxels.
     pub step_voxels: f32,
-    /// The length of a step of a shadow ray, in voxels.
+    /// The length of the first step of a shadow ray, in voxels.
     pub shadow_step_voxels: f32,
+    /// Each step of a shadow ray is longer than the one before by this part of the first: what is far from the
+    /// lit point need not be known as well.
+    pub shadow_growth: f32,
     /// A ray ends where less than this share of the light passes.
     pub min_transmittance: f32,
     /// Shadow rays towards the sun for a camera ray all of whose light is scattered; more where the medium is
@@ -59,6 +62,7 @@ impl Default for Quality {
         Quality {
             step_voxels: 0.5,
             shadow_step_voxels: 2.0,
+            shadow_growth: 0.05,
             min_transmittance: 3e-4,
             sun_rays: 16,
             sky_rays: 8,
@@ -182,8 +186,11 @@ impl<'s> Marcher<'s> {
             emission.as_ref().map_or(0.0, |(_, _, local, _)| local.direction.length()),
         ];
         let voxels_per_length = voxels_per_length[0].max(voxels_per_length[1]);
-        let lattice =
-            Lattice { step: self.quality.step_voxels / voxels_per_length, shift: unit_f32(hash_u32(random)) };
+        let lattice = Lattice {
+            step: self.quality.step_voxels / voxels_per_length,
+            shift: unit_f32(hash_u32(random)),
+            curvature: 0.0,
+        };
         let mut lighting =
             density.as_ref().map(|(field, local, _)| Lighting::new(self, field, ray, *local, random));
 
@@ -399,7 +406,8 @@ impl<'m, 's> Lighting<'m, 's> {
             ^ position.y.to_bits().rotate_left(11)
             ^ position.z.to_bits().rotate_left(22);
         let shift = unit_f32(hash_u32(self.random ^ bits));
-        let lattice = Lattice::new(self.marcher.quality.shadow_step_voxels, &ray, shift);
+        let Quality { shadow_step_voxels, shadow_growth, .. } = self.marcher.quality;
+        let lattice = Lattice::new(shadow_step_voxels, &ray, shift).growing(shadow_growth);
         let scale = self.marcher.scene.medium.density_scale;
         let end = self.density.exit(&ray);
         let limit = self.marcher.max_shadow_depth;
@@ -407,16 +415,25 @@ impl<'m, 's> Lighting<'m, 's> {
     }
 }
 
-/// Where steps end: at `(k + shift) × step` for all integers k.
+/// Where steps end: at w((k + shift) × step) for all integers k, where w(u) = u + ½ curvature × u² lets steps
+/// grow along the ray.
 #[derive(Debug, Clone, Copy)]
 struct Lattice {
     step: f32,
     shift: f32,
+    /// Growth of the step per length.
+    curvature: f32,
 }
 
 impl Lattice {
+    /// Equal steps.
     fn new(step_voxels: f32, ray: &LocalRay, shift: f32) -> Self {
-        Lattice { step: step_voxels / ray.direction.length(), shift }
+        Lattice { step: step_voxels / ray.direction.length(), shift, curvature: 0.0 }
+    }
+
+    /// Steps each of which is longer than the one before by `growth` times the first.
+    fn growing(self, growth: f32) -> Self {
+        Lattice { curvature: growth / self.step, ..self }
     }
 
     /// Calls `step(t0, t1)` for all steps between `start` and `end`, the first and last cut to them, until it
@@ -425,11 +442,17 @@ impl Lattice {
     fn steps(self, start: f32, end: f32, step: &mut impl FnMut(f32, f32) -> bool) -> bool {
         // A million steps at most, which single precision can still count.
         let length = self.step.max(end * 1e-6);
-        let mut k = floor(start / length - self.shift);
+        let uniform = if self.curvature > 0.0 {
+            ((1.0 + 2.0 * self.curvature * start).sqrt() - 1.0) / self.curvature
+        } else {
+            start
+        };
+        let mut k = floor(uniform / length - self.shift);
         let mut t0 = start;
         while t0 < end {
             k += 1;
-            let t1 = ((k as f32 + self.shift) * length).min(end);
+            let u = (k as f32 + self.shift) * length;
+            let t1 = (u + 0.5 * self.curvature * u * u).min(end);
             // Where rounding makes a step empty it is passed over.
             if t1 > t0 {
                 if !step(t0, t1) {

@@ -11,6 +11,7 @@
 use glam::{DMat3, DVec3, IVec3, Mat3, Vec3};
 use nuage_volume::accessor::Accessor;
 use nuage_volume::channel::Channel;
+use nuage_volume::space::LOG2_NODE5_BRICKS;
 use nuage_volume::tree::Content;
 
 use crate::blocks::Blocks;
@@ -181,6 +182,7 @@ impl<'a> Field<'a> {
             t_brick: (8.0 * ray.inverse).abs(),
             sign: IVec3::select(forward, IVec3::ONE, IVec3::NEG_ONE),
             brick_end: IVec3::select(forward, self.brick_box[1] + 1, self.brick_box[0] - 1),
+            root_leaps_left: 4096,
             waiting: [Run { t0, t1, kind: RunKind::Varying }; 3],
             waiting_count: 0,
         };
@@ -222,6 +224,9 @@ pub(crate) fn floor(x: f32) -> i32 {
     i.saturating_sub(i32::from(x < i as f32))
 }
 
+/// Root tables up to this size are searched for the next cell; through larger ones a ray goes cell by cell.
+const MAX_ROOT_LEAP: usize = 512;
+
 /// The iterator of [`Field::runs`].
 #[derive(Debug)]
 pub struct Runs<'r, 'a> {
@@ -239,6 +244,8 @@ pub struct Runs<'r, 'a> {
     /// The step to the next brick along each axis, and the first brick outside in that direction.
     sign: IVec3,
     brick_end: IVec3,
+    /// Rounding must not let a ray leap between two cells for ever.
+    root_leaps_left: u32,
     /// Runs found and not yet given out, the last one first.
     waiting: [Run; 3],
     waiting_count: usize,
@@ -288,6 +295,40 @@ impl Runs<'_, '_> {
         if !inside {
             self.t_end = self.t_end.min(self.t);
         }
+        self.aim();
+    }
+
+    /// Moves on to the next cell of the root table that has an entry, over all cells that have none: between
+    /// the parts of a scattered volume there may be a million of them.
+    fn leap_to_root_entry(&mut self) {
+        let root = &self.accessor.tree().root;
+        if root.len() > MAX_ROOT_LEAP || self.root_leaps_left == 0 {
+            return;
+        }
+        self.root_leaps_left -= 1;
+        let mut next: Option<(f32, IVec3)> = None;
+        for entry in root {
+            let first = entry.cell << LOG2_NODE5_BRICKS;
+            let position = |brick: IVec3| (brick - self.base_brick).as_vec3() * 8.0;
+            let [t0, t1] = self.ray.box_interval(position(first), position(first + 512));
+            let t0 = t0.max(self.t);
+            if t0 < t1 && next.is_none_or(|(t, _)| t0 < t) {
+                next = Some((t0, first));
+            }
+        }
+        let Some((t, first)) = next else {
+            self.t_end = self.t_end.min(self.t);
+            return;
+        };
+        self.t = t;
+        let position = self.ray.at(t) * 0.125;
+        let brick = IVec3::new(floor(position.x), floor(position.y), floor(position.z));
+        let [box_first, box_last] = self.brick_box;
+        let (first, last) = (first.max(box_first), (first + 511).min(box_last));
+        if first.cmpgt(last).any() {
+            return;
+        }
+        self.brick = brick.wrapping_add(self.base_brick).clamp(first, last);
         self.aim();
     }
 
@@ -363,6 +404,9 @@ impl Iterator for Runs<'_, '_> {
             }
             if footprint.is_constant() {
                 if footprint.max == 0.0 {
+                    if log2_bricks == LOG2_NODE5_BRICKS {
+                        self.leap_to_root_entry();
+                    }
                     if varying.is_some() {
                         break;
                     }

@@ -291,8 +291,13 @@ fn brute_force(dense: &Dense, ray: &Ray, sigma: f64, g: f64, to_sun: DVec3) -> [
 fn phase_function_and_lights_agree_with_brute_force() {
     let (json, density) = (json(), channel("density"));
     let dense = Dense::new(&density);
-    let quality =
-        Quality { sky_rays: 512, sun_rays: u32::MAX, shadow_step_voxels: 0.5, ..Quality::default() };
+    let quality = Quality {
+        sky_rays: 512,
+        sun_rays: u32::MAX,
+        shadow_step_voxels: 0.5,
+        shadow_growth: 0.0,
+        ..Quality::default()
+    };
     for g in [0.8f32, -0.5] {
         let full = lit_scene(&json, &density, g);
         for (x, y) in [(64.5, 64.5), (50.5, 80.5)] {

@@ -34,6 +34,11 @@ impl<'a> Accessor<'a> {
         accessor
     }
 
+    /// The tree that is read.
+    pub fn tree(&self) -> &'a Tree {
+        self.tree
+    }
+
     /// The region around a brick.
     #[inline]
     pub fn region(&mut self, brick: IVec3) -> Region {

@@ -3,7 +3,7 @@
 //! The builder collects regions in ordered maps, adds entries for zero regions that touch others, computes
 //! every footprint, and flattens the maps into the arrays of [`Tree`].
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, btree_map};
 use std::iter::repeat_n;
 
 use glam::IVec3;
@@ -95,17 +95,18 @@ impl TreeBuilder {
     /// given to [`TreeBuilder::finish`].
     ///
     /// # Errors
-    /// If something is there already.
+    /// If something is there already, which then stays.
     pub fn brick(&mut self, brick: IVec3, summary: BrickSummary) -> Result<u32, BuildError> {
         let index = self.summaries.len() as u32;
+        self.leaf(brick, Leaf::Brick(index))?;
         self.summaries.push(summary);
-        self.leaf(brick, Leaf::Brick(index)).map(|()| index)
+        Ok(index)
     }
 
     /// Places a brick that was added before at another brick coordinate as well.
     ///
     /// # Errors
-    /// If something is there already.
+    /// If something is there already, which then stays.
     ///
     /// # Panics
     /// If no brick of that index was added.
@@ -117,18 +118,21 @@ impl TreeBuilder {
     /// Adds a region of one value around a brick: the aligned cube of that size.
     ///
     /// # Errors
-    /// If something is there already.
+    /// If something is there already, which then stays.
     pub fn tile(&mut self, brick: IVec3, size: TileSize, value: f32) -> Result<(), BuildError> {
-        let cell = root_cell(brick).to_array();
-        let replaced = match size {
-            TileSize::Node5 => self.root.insert(cell, Slot::Tile(value)).is_some(),
-            TileSize::Node4 => match self.root.entry(cell).or_insert_with(|| Slot::Child(Node5::new())) {
-                Slot::Tile(_) => true,
-                Slot::Child(node5) => node5.insert(node5_slot(brick) as u16, Slot::Tile(value)).is_some(),
-            },
+        let overlap = BuildError::Overlap(brick << 3);
+        let cell = self.root.entry(root_cell(brick).to_array());
+        let vacant = match size {
             TileSize::Brick => return self.leaf(brick, Leaf::Tile(value)),
+            TileSize::Node5 => insert_if_vacant(cell, Slot::Tile(value)),
+            TileSize::Node4 => match cell.or_insert_with(|| Slot::Child(Node5::new())) {
+                Slot::Tile(_) => false,
+                Slot::Child(node5) => {
+                    insert_if_vacant(node5.entry(node5_slot(brick) as u16), Slot::Tile(value))
+                }
+            },
         };
-        if replaced { Err(BuildError::Overlap(brick << 3)) } else { Ok(()) }
+        if vacant { Ok(()) } else { Err(overlap) }
     }
 
     fn leaf(&mut self, brick: IVec3, leaf: Leaf) -> Result<(), BuildError> {
@@ -152,8 +156,11 @@ impl TreeBuilder {
                 node4
             }
         };
-        match std::mem::replace(&mut self.node4s[node4][node4_slot(brick)], leaf) {
-            Leaf::Absent => Ok(()),
+        match &mut self.node4s[node4][node4_slot(brick)] {
+            at @ Leaf::Absent => {
+                *at = leaf;
+                Ok(())
+            }
             _ => Err(overlap),
         }
     }
@@ -410,6 +417,17 @@ impl Bordered {
         let index = |at: IVec3| (at.x * 17 + at.y) * 17 + at.z;
         let here = index(node4_slot_brick(IVec3::splat(-self.direction.min(0)), slot));
         std::array::from_fn(|axes| self.leaves[(here + self.direction * index(step(axes))) as usize])
+    }
+}
+
+/// Fills a place of a map. Whether it was free.
+fn insert_if_vacant<K: Ord, V>(entry: btree_map::Entry<'_, K, V>, value: V) -> bool {
+    match entry {
+        btree_map::Entry::Vacant(place) => {
+            place.insert(value);
+            true
+        }
+        btree_map::Entry::Occupied(_) => false,
     }
 }
 

@@ -60,7 +60,6 @@ fn random(placed: &[(i8, i8, i8, u8)], with_root_tile: bool, half: bool) -> (Tre
             0 if builder.tile(brick & !15, TileSize::Node4, 0.75).is_ok() => {
                 naive.regions.push((brick & !15, 16, Err(0.75)));
             }
-            0 => break, // a tile over bricks replaced them: the builder is of no more use
             1 if builder.tile(brick, TileSize::Brick, 0.5).is_ok() => {
                 naive.regions.push((brick, 1, Err(0.5)));
             }
@@ -138,6 +137,12 @@ fn overlaps_are_refused() {
     assert!(builder.tile(IVec3::ONE, TileSize::Node5, 1.0).is_err());
     assert!(builder.tile(IVec3::splat(600), TileSize::Node5, 1.0).is_ok());
     assert!(builder.brick(IVec3::splat(601), summary).is_err());
+
+    // What was there first has stayed, and what was refused left nothing behind.
+    let tree = builder.finish(Bricks::F32(vec![1.0; 512])).unwrap();
+    assert_eq!(tree.region(IVec3::ZERO).content, Content::Brick(0));
+    assert_eq!(tree.region(IVec3::ONE).content, Content::Constant(0.0));
+    assert_eq!(tree.region(IVec3::splat(601)).content, Content::Constant(1.0));
 }
 
 #[test]
