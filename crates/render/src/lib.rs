@@ -1,8 +1,8 @@
 //! The CPU renderer: the reference that every other renderer of the project is held to.
 //!
 //! [`scene`] says what is rendered and [`camera`] from where; [`traverse`] walks rays through the packed tree;
-//! [`blocks`] keeps the
-//! decoded bricks near a thread's rays; [`march`] integrates light along them; [`picture`] runs that over all pixels; [`framing`] finds views and
+//! [`blocks`] keeps
+//! decoded bricks; [`march`] integrates light along them; [`picture`] runs that over all pixels; [`framing`] finds views and
 //! densities for volumes that nobody described; [`film`] and [`output`] hold and encode pictures. Physics in
 //! small functions: [`phase`], [`color`], [`math`], [`hash`].
 //!

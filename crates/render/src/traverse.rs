@@ -14,7 +14,7 @@ use nuage_volume::channel::Channel;
 use nuage_volume::space::LOG2_NODE5_BRICKS;
 use nuage_volume::tree::Content;
 
-use crate::blocks::Blocks;
+use crate::blocks::{BlockStore, Blocks};
 use crate::camera::Ray;
 
 /// A channel made ready for rays: its transform inverted, its extent in the coordinates of the walk.
@@ -24,6 +24,7 @@ use crate::camera::Ray;
 #[derive(Debug, Clone)]
 pub struct Field<'a> {
     channel: &'a Channel,
+    blocks: BlockStore,
     index_from_world: DMat3,
     /// World origin in positions of the walk.
     offset: DVec3,
@@ -91,6 +92,7 @@ impl<'a> Field<'a> {
         let inverse = channel.world_from_index.inverse();
         Some(Field {
             channel,
+            blocks: BlockStore::new(&channel.tree),
             index_from_world: inverse.matrix3,
             offset: inverse.translation - base,
             base_brick,
@@ -104,7 +106,7 @@ impl<'a> Field<'a> {
         Reader {
             walker: Accessor::new(&self.channel.tree),
             shadow_walker: Accessor::new(&self.channel.tree),
-            blocks: Blocks::new(&self.channel.tree),
+            blocks: Blocks::new(&self.channel.tree, &self.blocks),
         }
     }
 

@@ -5,6 +5,7 @@ mod common;
 
 use common::{Random, absorbing, any_camera, clip, line_integral, to_index, trilinear, voxel};
 use glam::{DAffine3, DMat3, DQuat, DVec3, EulerRot, IVec3};
+use nuage_render::blocks::{BlockStore, Blocks};
 use nuage_render::camera::Ray;
 use nuage_render::march::{Marcher, Quality};
 use nuage_render::traverse::{Field, Run, RunKind};
@@ -311,7 +312,8 @@ fn blocks_return_what_the_accessor_returns() {
     let mut random = Random(4711);
     for half_extent in [40, 9000] {
         let channel = random_channel(&mut random, IVec3::ZERO, false, DAffine3::IDENTITY);
-        let mut blocks = nuage_render::blocks::Blocks::new(&channel.tree);
+        let store = BlockStore::new(&channel.tree);
+        let mut blocks = Blocks::new(&channel.tree, &store);
         let mut accessor = nuage_volume::accessor::Accessor::new(&channel.tree);
         let index = channel.active_box.expect("a box");
         let mut not_zero = 0;

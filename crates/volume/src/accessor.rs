@@ -11,6 +11,17 @@ use crate::space::{
 };
 use crate::tree::{Content, Entry, Region, Tree};
 
+/// What the tree has at the place of a brick.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum BrickPlace {
+    /// The entry of this index, in the level of the `Node4`.
+    Entry(usize),
+    /// No entry in an existing `Node4`: samples are zero.
+    Zero,
+    /// No `Node4`: a larger region of one value, or nothing.
+    Tile,
+}
+
 /// A reader of a [`Tree`] that remembers where it was.
 #[derive(Debug, Clone)]
 pub struct Accessor<'a> {
@@ -48,6 +59,22 @@ impl<'a> Accessor<'a> {
             return self.tree.region_in_node4(node4, brick);
         }
         self.region_from_node5(brick)
+    }
+
+    /// Where a brick stands among the entries of all `Node4`: [`BrickPlace::Entry`] gives the index.
+    #[inline]
+    pub fn place(&mut self, brick: IVec3) -> BrickPlace {
+        let key = brick >> LOG2_NODE4_BRICKS;
+        if self.node4.is_none_or(|(known, _)| known != key) {
+            self.region_from_node5(brick);
+        }
+        match self.node4 {
+            Some((known, node4)) if known == key => {
+                let entry = self.tree.node4.entry_index(node4, NODE4_SLOTS, node4_slot(brick));
+                entry.map_or(BrickPlace::Zero, BrickPlace::Entry)
+            }
+            _ => BrickPlace::Tile,
+        }
     }
 
     /// The extent of the region around a brick (as [`Region::log2_bricks`]) and its footprint: all that a walk
