@@ -1,6 +1,6 @@
 //! `nuage demo`: renders the sample sequence that comes with the program.
 //!
-//! The volumes are in [`sample`](crate::sample), the means in [`shot`](crate::shot); here stand the choices of
+//! The volumes are in [`sample`](crate::sample), the means in [`shot`]; here stand the choices of
 //! taste.
 
 use std::fs;

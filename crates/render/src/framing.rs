@@ -16,7 +16,7 @@ const TARGET_LUMINANCE: f32 = 1.0;
 /// Rays per side of the grid that probes the volume.
 const PROBES: u32 = 32;
 /// Room around the volume in the picture.
-const MARGIN: f64 = 1.0;
+const MARGIN: f64 = 1.04;
 
 /// A box in world space.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -99,8 +99,8 @@ pub fn fit_density_scale(density: &Channel, camera: &Camera, aspect: f64) -> Opt
     valid_scale(TARGET_DEPTH / depth?)
 }
 
-/// How many times brighter an emission has to be so that the brighter rays of a view have a luminance around
-/// [`TARGET_LUMINANCE`]. `None` if no ray meets anything that glows.
+/// How many times brighter an emission has to be so that the brighter rays of a view have a luminance around one,
+/// white in a picture. `None` if no ray meets anything that glows.
 pub fn fit_emission_scale(emission: &Emission<'_>, camera: &Camera, aspect: f64) -> Option<f32> {
     // The glowing channel stands in for the density, of which nothing is seen.
     let density = emission.channel;
