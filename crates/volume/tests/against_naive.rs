@@ -112,6 +112,7 @@ proptest! {
         for p in all {
             let index = p.floor().as_ivec3();
             prop_assert_eq!(accessor.voxel(index), naive.voxel(index));
+            prop_assert_eq!(accessor.nearest(p), naive.voxel((p + 0.5).floor().as_ivec3()));
             let (got, want) = (accessor.trilinear(p), naive.trilinear(p));
             prop_assert!((got - want).abs() <= 1e-5, "{} at {}, not {}", got, p, want);
             let region = tree.region(index >> 3);
