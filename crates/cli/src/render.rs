@@ -112,8 +112,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     for (i, job) in jobs.iter().enumerate() {
         bar.set_message(job.output.display().to_string());
         let show = |done, total| progress::show(&bar, i, done, total);
-        let first = loaded.take().filter(|_| frames.len() == 1);
-        if let Err(failure) = render_frame(args, &shot, job, first, &show) {
+        if let Err(failure) = render_frame(args, &shot, job, loaded.take(), &show) {
             bar.suspend(|| failure.report());
             failed = true;
         }

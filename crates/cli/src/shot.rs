@@ -127,24 +127,24 @@ impl<'l> Shot<'l> {
                 &mut volumes.iter().filter_map(|v| framing::fit_density_scale(&v.density, &camera, aspect)),
             ),
         };
-        let unscaled = spectrum(look, 1.0);
-        let spectrum = unscaled.map(|unscaled| match look.emission {
-            Auto::Value(scale) => spectrum(look, scale).unwrap_or(unscaled),
-            Auto::Auto => {
-                let scale = smallest(&mut volumes.iter().filter_map(|volume| {
+        let spectrum = spectrum(look).map(|unscaled| {
+            let scale = match look.emission {
+                Auto::Value(scale) => scale,
+                Auto::Auto => smallest(&mut volumes.iter().filter_map(|volume| {
                     let channel = volume.emission.as_ref()?;
                     let emission = Emission { channel, spectrum: unscaled.clone() };
                     framing::fit_emission_scale(&emission, &camera, aspect)
-                }));
-                spectrum(look, scale).unwrap_or(unscaled)
-            }
+                })),
+            };
+            unscaled.brighter(scale)
         });
         Ok(Shot { look, camera, density_scale, spectrum })
     }
 
     /// Whether volumes are looked at to settle what the options leave open.
     pub(crate) fn needs_volumes(look: &Look) -> bool {
-        look.density == Auto::Auto || (look.emission == Auto::Auto && spectrum(look, 1.0).is_some())
+        let glows = look.temperature.is_some() || look.flame.is_some();
+        look.density == Auto::Auto || (look.emission == Auto::Auto && glows)
     }
 
     /// Camera and scales in words, so that the shot can be repeated.
@@ -216,14 +216,13 @@ fn z_is_up(look: &Look) -> bool {
     look.up.z.abs() > look.up.y.abs()
 }
 
-fn spectrum(look: &Look, scale: f32) -> Option<Spectrum> {
+/// The light of the grid that glows, at a scale of 1.
+fn spectrum(look: &Look) -> Option<Spectrum> {
     if look.temperature.is_some() {
         let table = Box::new(Blackbody::new(REFERENCE_KELVIN));
-        Some(Spectrum::Blackbody { kelvin_per_unit: look.kelvin, scale, table })
-    } else if look.flame.is_some() {
-        Some(Spectrum::Linear { rgb: look.flame_color.map(|c| c * scale) })
+        Some(Spectrum::Blackbody { kelvin_per_unit: look.kelvin, scale: 1.0, table })
     } else {
-        None
+        look.flame.as_ref().map(|_| Spectrum::Linear { rgb: look.flame_color })
     }
 }
 

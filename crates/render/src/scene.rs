@@ -53,6 +53,17 @@ pub enum Spectrum {
 }
 
 impl Spectrum {
+    /// The same light, `factor` times as bright.
+    #[must_use]
+    pub fn brighter(self, factor: f32) -> Self {
+        match self {
+            Spectrum::Linear { rgb } => Spectrum::Linear { rgb: rgb.map(|c| c * factor) },
+            Spectrum::Blackbody { kelvin_per_unit, scale, table } => {
+                Spectrum::Blackbody { kelvin_per_unit, scale: scale * factor, table }
+            }
+        }
+    }
+
     /// Radiance per world length.
     #[inline]
     pub fn radiance(&self, value: f32) -> Vec3 {

@@ -36,8 +36,13 @@ fn every_float_grid_equals_the_truth() {
             }
         }
     }
-    // What is committed holds this much at least.
-    assert!(files >= 30 && grids >= 40, "only {grids} float grids in {files} files were found");
+    // What is committed is less than what lies outside.
+    let (least_files, least_grids) =
+        if testkit::data_roots()[0].join("data").is_dir() { (40, 60) } else { (30, 40) };
+    assert!(
+        files >= least_files && grids >= least_grids,
+        "only {grids} float grids in {files} files were found"
+    );
 }
 
 fn check_metadata(metadata: &nuage_vdb::Metadata, want: &Value) {
