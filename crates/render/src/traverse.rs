@@ -87,8 +87,8 @@ impl<'a> Field<'a> {
         let (min, max) = (active.min.saturating_sub(IVec3::ONE), active.max);
         // One brick before the first, so that positions are not negative.
         let base_brick: IVec3 = (min >> 3) - 1;
-        let base: IVec3 = base_brick << 3;
-        let base = base.as_dvec3();
+        // In doubles: at the low end of index space this lies outside of 32 bits.
+        let base = base_brick.as_dvec3() * 8.0;
         let inverse = channel.world_from_index.inverse();
         Some(Field {
             channel,

@@ -306,6 +306,27 @@ fn optical_depth_follows_the_voxels() {
     }
 }
 
+/// A brick at either end of index space has the optical depth of its voxels.
+#[test]
+fn the_ends_of_index_space_are_seen() {
+    for brick in [IVec3::splat(-(1 << 28)), IVec3::splat((1 << 28) - 1)] {
+        let values = [1.0; 512];
+        let mut builder = TreeBuilder::new();
+        builder.brick(brick, BrickSummary::of(&values)).expect("a free place");
+        let tree = builder.finish(Bricks::F32(values.to_vec())).expect("a small tree");
+        let min: IVec3 = brick << 3;
+        let active_box = Some(IndexBox { min, max: min + 7 });
+        let channel = Channel { tree, world_from_index: DAffine3::IDENTITY, active_box };
+        let scene = absorbing(any_camera(), &channel, 1.0);
+        let marcher = Marcher::new(&scene, Quality { step_voxels: 0.25, ..Quality::default() });
+        let origin = min.as_dvec3() + DVec3::new(3.5, 3.5, -20.0);
+        let ray = Ray { origin, direction: DVec3::Z };
+        let depth = marcher.depth_per_scale(&mut marcher.worker(), &ray);
+        // Eight voxels, of which the high end of index space has no neighbour to blend with.
+        assert!(depth > 7.4 && depth < 8.1, "{depth} at {brick}");
+    }
+}
+
 /// Blocks hold what the accessor reads: bricks, tiles, empty space and all borders between them.
 #[test]
 fn blocks_return_what_the_accessor_returns() {
