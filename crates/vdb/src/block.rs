@@ -1,38 +1,49 @@
 //! Value blocks: how the values of a node or leaf are laid out and compressed.
 //!
-//! A block opens with a byte that says how the inactive values can be restored (file version 222 and later),
-//! then the distinct inactive values and a mask that selects between them where there are any, then the stored
-//! values: all of them, or with active-mask compression only the active ones; raw, ZIP or Blosc; as written or
-//! as half floats. The same parse serves to skip a block and to decode it.
-
-use half::f16;
-use half::slice::HalfFloatSliceExt;
+//! From file version 222 on a block opens with a byte that says how the inactive values can be restored, then the
+//! distinct inactive values and a mask that selects between them where there are any. Then the stored values: all of
+//! them, or with active-mask compression only the active ones; raw, ZIP or Blosc; as written or as half floats. The
+//! same parse serves to skip a block and to decode it; how a block is written lives in [`crate::write`].
 
 use crate::codec::{self, CodecError, Scratch};
 use crate::error::{Error, Result};
-use crate::source::Cursor;
+use crate::source::Reader;
+use crate::value::Value;
 
-const COMPRESS_ZIP: u32 = 1;
-const COMPRESS_ACTIVE_MASK: u32 = 2;
-const COMPRESS_BLOSC: u32 = 4;
+pub(crate) const COMPRESS_ZIP: u32 = 1;
+pub(crate) const COMPRESS_ACTIVE_MASK: u32 = 2;
+pub(crate) const COMPRESS_BLOSC: u32 = 4;
 
 // The first byte of a block.
-const MINUS_BACKGROUND: u8 = 1;
-const ONE_INACTIVE_VALUE: u8 = 2;
-const MASK_OF_BACKGROUNDS: u8 = 3;
-const MASK_AND_ONE_INACTIVE_VALUE: u8 = 4;
-const MASK_AND_TWO_INACTIVE_VALUES: u8 = 5;
-const ALL_VALUES: u8 = 6;
+pub(crate) const BACKGROUND: u8 = 0;
+pub(crate) const MINUS_BACKGROUND: u8 = 1;
+pub(crate) const ONE_INACTIVE_VALUE: u8 = 2;
+pub(crate) const MASK_OF_BACKGROUNDS: u8 = 3;
+pub(crate) const MASK_AND_ONE_INACTIVE_VALUE: u8 = 4;
+pub(crate) const MASK_AND_TWO_INACTIVE_VALUES: u8 = 5;
+pub(crate) const ALL_VALUES: u8 = 6;
 
-/// How a grid's values are written: the compression flags of the file and the width of a value.
+/// How the values of a grid are compressed: the flags of the file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Compression {
-    flags: u32,
+    pub(crate) flags: u32,
 }
 
 impl Compression {
-    pub(crate) fn read(cursor: &mut Cursor<'_>) -> Result<Self> {
-        let flags = cursor.u32("compression flags")?;
+    /// Values as they are.
+    pub const NONE: Compression = Compression { flags: COMPRESS_ACTIVE_MASK };
+    /// Values deflated.
+    pub const ZIP: Compression = Compression { flags: COMPRESS_ZIP | COMPRESS_ACTIVE_MASK };
+    /// Values shuffled and compressed with LZ4: OpenVDB's default.
+    pub const BLOSC: Compression = Compression { flags: COMPRESS_BLOSC | COMPRESS_ACTIVE_MASK };
+
+    /// The same with the values of inactive voxels stored too.
+    pub fn with_all_values(self) -> Self {
+        Compression { flags: self.flags & !COMPRESS_ACTIVE_MASK }
+    }
+
+    pub(crate) fn read(reader: &mut Reader<'_>) -> Result<Self> {
+        let flags = reader.u32("compression flags")?;
         match flags & !(COMPRESS_ZIP | COMPRESS_ACTIVE_MASK | COMPRESS_BLOSC) {
             0 => Ok(Compression { flags }),
             _ => Err(Error::unsupported(format!("compression flags {flags:#x}"))),
@@ -57,140 +68,187 @@ impl Compression {
     }
 }
 
-/// The width of the values in a file, in bytes.
+/// How the blocks of a grid are written.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct ValueLayout {
-    /// A value as it stands alone: background, tiles of the root, inactive values.
-    pub(crate) value_bytes: usize,
-    /// A value inside a block: smaller if the grid is saved as half.
-    pub(crate) stored_bytes: usize,
+pub(crate) struct BlockFormat {
+    pub(crate) compression: Compression,
+    /// Whether values are saved as half floats, if the type has such a form.
+    pub(crate) half: bool,
+    /// The version of the file.
+    pub(crate) file_version: u32,
 }
 
-impl ValueLayout {
-    /// The layout of a value type, `None` if the type has no fixed-size blocks or is not known.
-    pub(crate) fn of(value_type: &str, saved_as_half: bool) -> Option<Self> {
-        let (value_bytes, half_bytes) = match value_type {
-            "float" => (4, 2),
-            "double" => (8, 2),
-            "vec3s" => (12, 6),
-            "vec3d" => (24, 6),
-            "int32" => (4, 4),
-            "int64" => (8, 8),
-            "vec3i" => (12, 12),
-            _ => return None,
-        };
-        let stored_bytes = if saved_as_half { half_bytes } else { value_bytes };
-        Some(ValueLayout { value_bytes, stored_bytes })
+impl BlockFormat {
+    /// From this version on blocks open with a byte that tells of inactive values.
+    pub(crate) const INACTIVE_VALUES_SINCE: u32 = 222;
+
+    pub(crate) fn has_inactive_values(self) -> bool {
+        self.file_version >= Self::INACTIVE_VALUES_SINCE
+    }
+
+    /// The bytes of a value inside a block.
+    pub(crate) fn stored_bytes<V: Value>(self) -> usize {
+        if self.half { V::HALF_BYTES } else { V::SIZE_BYTES }
     }
 }
 
-/// A parsed block, its parts still as in the file.
-pub(crate) struct Block<'a> {
+/// A parsed block: where its parts stand in the file.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Block {
+    begin: u64,
     kind: u8,
-    inactive: [&'a [u8]; 2],
-    selection: &'a [u8],
+    inactive_at: u64,
+    selection_at: u64,
+    selection_bytes: usize,
     stored_count: usize,
-    payload: Payload<'a>,
-    /// Where the payload begins in the file.
-    offset: u64,
+    codec: Codec,
+    payload_at: u64,
+    payload_bytes: usize,
 }
 
-enum Payload<'a> {
-    Raw(&'a [u8]),
-    Zip(&'a [u8]),
-    Blosc(&'a [u8]),
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Codec {
+    Raw,
+    Zip,
+    Blosc,
 }
 
-/// Parses the block of a node with `slots` values of which `active` are active.
-pub(crate) fn parse<'a>(
-    cursor: &mut Cursor<'a>,
-    compression: Compression,
-    layout: ValueLayout,
+/// Compressed values are never larger than raw ones by more than a header. A file that says so is damaged, and would
+/// have us read it all at once.
+const MAX_COMPRESSED_SLACK: usize = 4096;
+
+/// Parses the block of a node with `slots` values of which `active` are active, and moves past it. Of its payload
+/// nothing is read.
+pub(crate) fn parse<V: Value>(
+    reader: &mut Reader<'_>,
+    format: BlockFormat,
     slots: usize,
     active: usize,
-) -> Result<Block<'a>> {
-    let kind = cursor.u8("a block's first byte")?;
+) -> Result<Block> {
+    let begin = reader.offset();
+    let kind = if format.has_inactive_values() { reader.u8("a block's first byte")? } else { ALL_VALUES };
     if kind > ALL_VALUES {
-        return Err(cursor.malformed(format!("{kind} does not say how inactive values are stored")));
+        return Err(
+            Error::malformed(begin, format!("{kind} does not say how inactive values are stored")),
+        );
     }
-    let mut inactive: [&[u8]; 2] = [&[], &[]];
-    if matches!(kind, ONE_INACTIVE_VALUE | MASK_AND_ONE_INACTIVE_VALUE | MASK_AND_TWO_INACTIVE_VALUES) {
-        inactive[0] = cursor.take(layout.value_bytes, "an inactive value")?;
-    }
-    if kind == MASK_AND_TWO_INACTIVE_VALUES {
-        inactive[1] = cursor.take(layout.value_bytes, "an inactive value")?;
-    }
+    let inactive_count = match kind {
+        ONE_INACTIVE_VALUE | MASK_AND_ONE_INACTIVE_VALUE => 1,
+        MASK_AND_TWO_INACTIVE_VALUES => 2,
+        _ => 0,
+    };
+    let inactive_at = reader.offset();
+    reader.skip((inactive_count * V::SIZE_BYTES) as u64, "an inactive value")?;
     let has_selection =
         matches!(kind, MASK_OF_BACKGROUNDS | MASK_AND_ONE_INACTIVE_VALUE | MASK_AND_TWO_INACTIVE_VALUES);
-    let selection = cursor.take(if has_selection { slots / 8 } else { 0 }, "a selection mask")?;
-    let stored_count = if compression.active_mask() && kind != ALL_VALUES { active } else { slots };
-    let stored_bytes = stored_count * layout.stored_bytes;
+    let selection_at = reader.offset();
+    let selection_bytes = if has_selection { slots / 8 } else { 0 };
+    reader.skip(selection_bytes as u64, "a selection mask")?;
+    let stored_count = if format.compression.active_mask() && kind != ALL_VALUES { active } else { slots };
+    let raw_bytes = stored_count * format.stored_bytes::<V>();
     // A half-saved block of no values has no payload at all; every other compressed one has at least a size.
-    let no_payload = stored_count == 0 && layout.stored_bytes != layout.value_bytes;
-    let codec = if no_payload { "none" } else { compression.codec() };
-    let mut offset = cursor.offset();
-    let payload = if codec == "none" {
-        Payload::Raw(cursor.take(stored_bytes, "the values of a node")?)
-    } else {
-        // A size that is not positive marks values that did not shrink and stand there as they are.
-        let size = cursor.i64("the size of a compressed block")?;
-        offset = cursor.offset();
-        let len = usize::try_from(size.unsigned_abs()).unwrap_or(usize::MAX);
-        if size <= 0 && len != stored_bytes {
-            return Err(cursor.malformed(format!("a block of {len} bytes where {stored_bytes} are expected")));
-        }
-        let bytes = cursor.take(len, "a compressed block")?;
-        match codec {
-            _ if size <= 0 => Payload::Raw(bytes),
-            "zip" => Payload::Zip(bytes),
-            _ => Payload::Blosc(bytes),
-        }
+    let no_payload = stored_count == 0 && format.half && V::HALF_BYTES != V::SIZE_BYTES;
+    let mut codec = match format.compression.codec() {
+        _ if no_payload => Codec::Raw,
+        "zip" => Codec::Zip,
+        "blosc" => Codec::Blosc,
+        _ => Codec::Raw,
     };
-    Ok(Block { kind, inactive, selection, stored_count, payload, offset })
+    let mut payload_bytes = raw_bytes;
+    if codec != Codec::Raw {
+        // A size that is not positive marks values that did not shrink and stand there as they are.
+        let size = reader.i64("the size of a compressed block")?;
+        payload_bytes = usize::try_from(size.unsigned_abs()).unwrap_or(usize::MAX);
+        if size <= 0 {
+            codec = Codec::Raw;
+        }
+        if codec == Codec::Raw && payload_bytes != raw_bytes {
+            return Err(
+                reader.malformed(format!("a block of {payload_bytes} bytes where {raw_bytes} are expected"))
+            );
+        }
+        if payload_bytes > 2 * raw_bytes + MAX_COMPRESSED_SLACK {
+            return Err(reader
+                .malformed(format!("a compressed block of {payload_bytes} bytes that stands for {raw_bytes}")));
+        }
+    }
+    let payload_at = reader.offset();
+    let what = if codec == Codec::Raw { "the values of a node" } else { "a compressed block" };
+    reader.skip(payload_bytes as u64, what)?;
+    Ok(Block {
+        begin,
+        kind,
+        inactive_at,
+        selection_at,
+        selection_bytes,
+        stored_count,
+        codec,
+        payload_at,
+        payload_bytes,
+    })
 }
 
-impl Block<'_> {
-    /// Decodes the values of a float node into `out`, one per slot.
-    pub(crate) fn decode_f32(
+/// Buffers that one thread reuses over many blocks.
+pub(crate) struct DecodeScratch<V> {
+    codec: Scratch,
+    bytes: Vec<u8>,
+    packed: Vec<V>,
+}
+
+impl<V> Default for DecodeScratch<V> {
+    fn default() -> Self {
+        DecodeScratch { codec: Scratch::default(), bytes: Vec::new(), packed: Vec::new() }
+    }
+}
+
+impl Block {
+    /// Decodes the values of the node into `out`, one per slot. The reader is the one that the block was parsed from.
+    pub(crate) fn decode<V: Value>(
         &self,
-        layout: ValueLayout,
-        background: f32,
+        reader: &mut Reader<'_>,
+        format: BlockFormat,
+        background: V,
         value_mask: &[u64],
-        out: &mut [f32],
-        scratch: &mut DecodeScratch,
+        out: &mut [V],
+        scratch: &mut DecodeScratch<V>,
     ) -> Result<()> {
-        let DecodeScratch { codec, bytes, halves, packed } = scratch;
-        bytes.resize(self.stored_count * layout.stored_bytes, 0);
-        let stored: &[u8] = match self.payload {
-            Payload::Raw(raw) => raw,
-            Payload::Zip(data) => {
-                codec::zlib::decompress(data, bytes, codec).map_err(|e| self.codec_error(e))?;
+        let DecodeScratch { codec, bytes, packed } = scratch;
+        let whole_bytes = (self.payload_at - self.begin) as usize + self.payload_bytes;
+        reader.load(self.begin, whole_bytes)?;
+        let payload = reader.loaded(self.payload_at, self.payload_bytes);
+        bytes.resize(self.stored_count * format.stored_bytes::<V>(), 0);
+        let stored: &[u8] = match self.codec {
+            Codec::Raw => payload,
+            Codec::Zip => {
+                codec::zlib::decompress(payload, bytes, codec).map_err(|e| self.codec_error(e))?;
                 bytes
             }
-            Payload::Blosc(chunk) => {
-                codec::blosc::decompress(chunk, bytes, codec).map_err(|e| self.codec_error(e))?;
+            Codec::Blosc => {
+                codec::blosc::decompress(payload, bytes, codec).map_err(|e| self.codec_error(e))?;
                 bytes
             }
-        };
-        let mut to_f32 = |values: &mut [f32]| match layout.stored_bytes {
-            2 => halves_to_f32(stored, values, halves),
-            _ => words_to_f32(stored, values),
         };
         if self.stored_count == out.len() {
-            to_f32(out);
+            V::decode(stored, format.half, out);
             return Ok(());
         }
-        packed.resize(self.stored_count, 0.0);
-        to_f32(packed);
-        let [inactive0, inactive1] = self.inactive_f32(background);
-        let selection = |word: usize| {
-            self.selection
-                .get(word * 8..word * 8 + 8)
-                .map_or(0, |b| u64::from_le_bytes(b.try_into().expect("eight bytes")))
-        };
+        packed.resize(self.stored_count, V::default());
+        V::decode(stored, format.half, packed);
+        let [inactive0, inactive1] = self.inactive_values(reader, background);
+        let selection_bytes = reader.loaded(self.selection_at, self.selection_bytes);
         let mut active = packed.iter();
         for (word, slots) in out.chunks_mut(64).enumerate() {
-            let (on, select) = (value_mask.get(word).copied().unwrap_or(0), selection(word));
+            let on = value_mask.get(word).copied().unwrap_or(0);
+            if on == 0 && self.selection_bytes == 0 {
+                slots.fill(inactive0);
+                continue;
+            }
+            let mut select = [0; 8];
+            if let Some(bytes) = selection_bytes.get(word * 8..) {
+                let len = bytes.len().min(8);
+                select[..len].copy_from_slice(&bytes[..len]);
+            }
+            let select = u64::from_le_bytes(select);
             for (bit, slot) in slots.iter_mut().enumerate() {
                 *slot = if on >> bit & 1 == 1 {
                     active.next().copied().unwrap_or(background)
@@ -205,47 +263,25 @@ impl Block<'_> {
     }
 
     /// The two inactive values: where the selection mask is off and where it is on.
-    fn inactive_f32(&self, background: f32) -> [f32; 2] {
+    fn inactive_values<V: Value>(&self, reader: &Reader<'_>, background: V) -> [V; 2] {
         let stored = |i: usize| {
-            let bytes: Option<[u8; 4]> = self.inactive[i].try_into().ok();
-            bytes.map(f32::from_le_bytes)
+            let at = self.inactive_at + (i * V::SIZE_BYTES) as u64;
+            V::from_bytes(reader.loaded(at, V::SIZE_BYTES))
         };
-        let first = match self.kind {
-            MINUS_BACKGROUND | MASK_OF_BACKGROUNDS => -background,
-            _ => stored(0).unwrap_or(background),
-        };
-        [first, stored(1).unwrap_or(background)]
+        match self.kind {
+            MINUS_BACKGROUND | MASK_OF_BACKGROUNDS => [background.negative(), background],
+            ONE_INACTIVE_VALUE | MASK_AND_ONE_INACTIVE_VALUE => [stored(0), background],
+            MASK_AND_TWO_INACTIVE_VALUES => [stored(0), stored(1)],
+            _ => [background; 2],
+        }
     }
 
     fn codec_error(&self, error: CodecError) -> Error {
         match error {
-            CodecError::Malformed(what) => Error::malformed(self.offset, what),
+            CodecError::Malformed(what) => Error::malformed(self.payload_at, what),
             CodecError::Unsupported(feature) => {
-                Error::unsupported(format!("{feature} (at byte {})", self.offset))
+                Error::unsupported(format!("{feature} (at byte {})", self.payload_at))
             }
         }
     }
-}
-
-/// Buffers that one thread reuses over many blocks.
-#[derive(Default)]
-pub(crate) struct DecodeScratch {
-    codec: Scratch,
-    bytes: Vec<u8>,
-    halves: Vec<f16>,
-    packed: Vec<f32>,
-}
-
-fn words_to_f32(bytes: &[u8], out: &mut [f32]) {
-    for (value, chunk) in out.iter_mut().zip(bytes.chunks_exact(4)) {
-        *value = f32::from_le_bytes(chunk.try_into().expect("four bytes"));
-    }
-}
-
-fn halves_to_f32(bytes: &[u8], out: &mut [f32], halves: &mut Vec<f16>) {
-    halves.clear();
-    halves.extend(bytes.chunks_exact(2).map(|b| f16::from_le_bytes(b.try_into().expect("two bytes"))));
-    // Both have one entry per value; the length is matched because the conversion insists on it.
-    halves.resize(out.len(), f16::ZERO);
-    halves.convert_to_f32_slice(out);
 }

@@ -1,25 +1,26 @@
-//! A file's header: versions, metadata and the list of grids, without their voxels.
+//! Opening files and reading grids, whole or a box of one.
 //!
 //! Opening reads headers only. Each grid says where it begins and ends, so one grid is read without touching
 //! the others. Files written as streams lack those positions; they are walked through once at opening.
 
-use crate::block::{Compression, ValueLayout};
+use std::sync::Arc;
+
+use half::f16;
+
+use crate::any::{AnyTree, Grid};
+use crate::block::BlockFormat;
+use crate::build;
 use crate::error::{Error, Result};
+use crate::header::{self, GridInfo, Header};
 use crate::limits::{Budget, Limits};
 use crate::metadata::Metadata;
+use crate::points;
 use crate::read;
-use crate::source::{Cursor, Source, parse_window};
+use crate::source::{Reader, Source};
+use crate::stats::IndexBox;
 use crate::transform::Transform;
-use crate::tree::Tree;
-
-/// The first eight bytes of every VDB file.
-const MAGIC: [u8; 8] = [0x20, 0x42, 0x44, 0x56, 0, 0, 0, 0];
-/// Version 222 moved compression flags from the file to each grid and stores active values only.
-const OLDEST_VERSION: u32 = 222;
-/// The newest version whose float grids are laid out as described here.
-const NEWEST_VERSION: u32 = 226;
-/// The appendix of a grid type's name that says that values are saved as half floats.
-const HALF_SUFFIX: &str = "_HalfFloat";
+use crate::tree::{Shape, Tree};
+use crate::value::{Value, ValueMask};
 
 /// An open VDB file: its header, and the source to read grids from.
 pub struct File<S> {
@@ -37,94 +38,35 @@ pub struct File<S> {
     pub grids: Vec<GridInfo>,
 }
 
-/// What the header says of a grid.
-#[derive(Debug, Clone)]
-pub struct GridInfo {
-    /// The name; several grids of a file may share it.
-    pub name: String,
-    /// The name with a number in brackets where several grids share it: `density[1]`.
-    pub unique_name: String,
-    /// The tree type without the mark for half floats: `Tree_float_5_4_3`.
-    pub grid_type: String,
-    /// Whether float values are saved as half floats.
-    pub save_float_as_half: bool,
-    /// How values are compressed.
-    pub compression: Compression,
-    /// The metadata of the grid.
-    pub metadata: Metadata,
-    /// The transform of the grid.
-    pub transform: Transform,
-    /// The unique name of the grid whose tree this one shares.
-    pub instance_of: Option<String>,
-    /// Where the grid's tree begins and the grid ends, in bytes from the start of the file.
-    tree_range: [u64; 2],
-}
-
-/// A grid with its voxels.
-#[derive(Debug, Clone)]
-pub struct Grid {
-    /// What the header says.
-    pub info: GridInfo,
-    /// The voxels.
-    pub tree: Tree,
+/// Runs an expression for the type of values of that name, or another one if there is none of that name.
+macro_rules! for_value_type {
+    ($name:expr, $value:ident => $body:expr, $otherwise:expr) => {
+        match $name {
+            "float" => for_value_type!(@ f32, $value, $body),
+            "double" => for_value_type!(@ f64, $value, $body),
+            "half" => for_value_type!(@ f16, $value, $body),
+            "int32" => for_value_type!(@ i32, $value, $body),
+            "int64" => for_value_type!(@ i64, $value, $body),
+            "bool" => for_value_type!(@ bool, $value, $body),
+            "mask" => for_value_type!(@ ValueMask, $value, $body),
+            "vec3s" => for_value_type!(@ [f32; 3], $value, $body),
+            "vec3d" => for_value_type!(@ [f64; 3], $value, $body),
+            "vec3i" => for_value_type!(@ [i32; 3], $value, $body),
+            _ => $otherwise,
+        }
+    };
+    (@ $type:ty, $value:ident, $body:expr) => {{
+        type $value = $type;
+        $body
+    }};
 }
 
 impl GridInfo {
-    /// The type of the values: `float`, `vec3s`, `ptdataidx32`, … as the grid type names it, but `bool` for
-    /// mask grids, whose values are the active states themselves.
-    pub fn value_type(&self) -> &str {
-        let name = self.grid_type.strip_prefix("Tree_").unwrap_or(&self.grid_type);
-        match name.split('_').next().unwrap_or(name) {
-            "mask" => "bool",
-            other => other,
-        }
-    }
-
-    /// `"fog volume"`, `"level set"`, `"staggered"` or `"unknown"`.
-    pub fn grid_class(&self) -> &str {
-        match self.metadata.string("class") {
-            Some(class @ ("fog volume" | "level set" | "staggered")) => class,
-            _ => "unknown",
-        }
-    }
-
-    /// The box of active voxels `[min, max]`, both ends included, as the writer noted it in the metadata.
-    pub fn file_bbox(&self) -> Option<[[i32; 3]; 2]> {
-        let (min, max) = (self.metadata.vec3i("file_bbox_min")?, self.metadata.vec3i("file_bbox_max")?);
-        (0..3).all(|i| min[i] <= max[i]).then_some([min, max])
-    }
-
-    /// Whether [`File::read_grid`] reads this type of grid.
+    /// Whether the grid's type is one that this crate reads.
     pub fn is_readable(&self) -> bool {
-        self.grid_type == "Tree_float_5_4_3"
+        let known = for_value_type!(self.stored_type(), _V => true, self.stored_type() == points::VALUE_TYPE);
+        known && self.shape().is_some()
     }
-
-    fn layout(&self) -> Option<ValueLayout> {
-        let standard = self.grid_type.ends_with("_5_4_3");
-        standard.then(|| ValueLayout::of(self.value_type(), self.save_float_as_half))?
-    }
-}
-
-/// The part of a grid's header that stands before its body.
-struct Descriptor {
-    unique_name: String,
-    name: String,
-    grid_type: String,
-    save_float_as_half: bool,
-    instance_of: Option<String>,
-    /// Where the grid's header begins and the grid ends; zero in a stream.
-    grid_begin: u64,
-    grid_end: u64,
-}
-
-struct Header {
-    file_version: u32,
-    library_version: [u32; 2],
-    has_offsets: bool,
-    uuid: String,
-    metadata: Metadata,
-    grid_count: u32,
-    end: u64,
 }
 
 impl<S: Source> File<S> {
@@ -142,45 +84,49 @@ impl<S: Source> File<S> {
     /// As [`File::open`], and if a limit is passed.
     pub fn open_with(source: S, limits: Limits) -> Result<Self> {
         let size = source.size_bytes()?;
-        let max_window = limits.max_memory_bytes;
-        let header = parse_window(&source, 0, 64 << 10, max_window, |cursor| {
-            read_header(cursor, &mut Budget::new(&limits))
-        })?;
+        let mut reader = Reader::new(&source, 0, size)?;
         let mut budget = Budget::new(&limits);
+        let header = header::read_header(&mut reader, &mut budget)?;
         let mut grids = Vec::new();
-        if header.has_offsets {
-            let mut at = header.end;
-            for _ in 0..header.grid_count {
-                let (descriptor, after) = parse_window(&source, at, 4 << 10, max_window, |cursor| {
-                    Ok((read_descriptor(cursor)?, cursor.offset()))
-                })?;
-                let Descriptor { grid_begin, grid_end, .. } = descriptor;
-                if grid_end > size {
-                    return Err(Error::malformed(
-                        after,
-                        format!("the grid '{}' ends at byte {grid_end} of {size}", descriptor.unique_name),
-                    ));
-                }
-                // Growing positions also bound the number of grids by the size of the file.
-                if grid_begin < after || grid_end < grid_begin {
-                    return Err(Error::malformed(after, "the positions of a grid are out of order"));
-                }
-                let (mut info, used) = parse_window(&source, grid_begin, 64 << 10, max_window, |cursor| {
-                    let mut budget = Budget::new(&limits);
-                    let info = read_grid_header(cursor, &descriptor, &mut budget)?;
-                    Ok((info, cursor.offset() - grid_begin))
-                })?;
-                take_grid_header(&mut budget, after - at + used)?;
-                if info.tree_range[0] > grid_end {
-                    return Err(Error::malformed(info.tree_range[0], "a grid's header passes its end"));
-                }
-                info.tree_range[1] = grid_end;
-                grids.push(info);
-                at = grid_end;
+        for _ in 0..header.grid_count {
+            let begin = reader.offset();
+            let descriptor = header::read_descriptor(&mut reader, header.file_version)?;
+            let after = reader.offset();
+            let (grid_begin, grid_end) = match header.has_offsets {
+                true => (descriptor.grid_begin, descriptor.grid_end),
+                false => (after, size),
+            };
+            if grid_end > size {
+                return Err(Error::malformed(
+                    after,
+                    format!("the grid '{}' ends at byte {grid_end} of {size}", descriptor.unique_name),
+                ));
             }
-        } else {
-            grids = walk_stream(&source, &header, size, &limits)?;
+            // Growing positions also bound the number of grids by the size of the file.
+            if grid_begin < after || grid_end < grid_begin {
+                return Err(Error::malformed(after, "the positions of a grid are out of order"));
+            }
+            reader.seek(grid_begin);
+            let mut info = header::read_grid_header(&mut reader, &header, &descriptor, &mut budget)?;
+            header::take_grid_header(&mut budget, after - begin + (reader.offset() - grid_begin))?;
+            if reader.offset() > grid_end {
+                return Err(Error::malformed(reader.offset(), "a grid's header passes its end"));
+            }
+            if header.file_version < header::INSTANCES_SINCE {
+                let format = block_format(&header, &info);
+                info.transform = transform_behind_topology(&source, &info, format, grid_end, &limits)?;
+            }
+            info.tree_range[1] = grid_end;
+            if !header.has_offsets {
+                if info.instance_of.is_none() {
+                    skip_tree(&mut reader, &info, block_format(&header, &info), &limits)?;
+                }
+                info.tree_range[1] = reader.offset();
+            }
+            reader.seek(info.tree_range[1]);
+            grids.push(info);
         }
+        drop(reader);
         let Header { file_version, library_version, uuid, metadata, .. } = header;
         Ok(File { source, limits, file_version, library_version, uuid, metadata, grids })
     }
@@ -199,141 +145,188 @@ impl<S: Source> File<S> {
     /// If the source fails, the bytes are damaged, the type of the grid is not supported, a limit is passed,
     /// or there is no such grid.
     pub fn read_grid(&self, index: usize) -> Result<Grid> {
-        let info = self
-            .grids
+        let info = self.info(index)?;
+        let tree = self.read_tree(self.owner(info)?, None)?;
+        Ok(grid_of(info, Arc::new(tree)))
+    }
+
+    /// Reads the voxels of grid `index` that lie in a box `[min, max]` of index space, both ends included. Of the
+    /// file's bytes those of leaves that lie outside are not decoded, and read only where they stand between others.
+    /// Everything outside the box is inactive background in the result; tiles that the box cuts are taken apart.
+    /// The leaves of point grids stay whole.
+    ///
+    /// # Errors
+    /// As [`File::read_grid`], and [`Error::Misuse`] if the box is empty.
+    pub fn read_grid_in_box(&self, index: usize, bbox: IndexBox) -> Result<Grid> {
+        if (0..3).any(|i| bbox[0][i] > bbox[1][i]) {
+            return Err(Error::Misuse(format!("the box {bbox:?} is empty: its minimum passes its maximum")));
+        }
+        let info = self.info(index)?;
+        let tree = self.read_tree(self.owner(info)?, Some(bbox))?;
+        Ok(grid_of(info, Arc::new(tree)))
+    }
+
+    /// Reads all grids. Those that share a tree in the file share it in memory.
+    ///
+    /// # Errors
+    /// As [`File::read_grid`]. The memory limit holds for each grid on its own.
+    pub fn read_all(&self) -> Result<Vec<Grid>> {
+        let mut trees: Vec<(&str, Arc<AnyTree>)> = Vec::new();
+        let mut grids = Vec::with_capacity(self.grids.len());
+        for info in &self.grids {
+            let owner = self.owner(info)?;
+            let known = trees.iter().find(|(name, _)| *name == owner.unique_name);
+            let tree = match known {
+                Some((_, tree)) => tree.clone(),
+                None => {
+                    let tree = Arc::new(self.read_tree(owner, None)?);
+                    trees.push((&owner.unique_name, tree.clone()));
+                    tree
+                }
+            };
+            grids.push(grid_of(info, tree));
+        }
+        Ok(grids)
+    }
+
+    fn info(&self, index: usize) -> Result<&GridInfo> {
+        self.grids
             .get(index)
-            .ok_or_else(|| Error::Misuse(format!("there is no grid {index}, only {}", self.grids.len())))?;
-        let owner = match &info.instance_of {
-            None => info,
-            Some(name) => self
-                .grids
-                .iter()
-                .find(|grid| grid.unique_name == *name && grid.instance_of.is_none())
-                .ok_or_else(|| {
-                    Error::malformed(
-                        info.tree_range[0],
-                        format!("the grid '{name}' that it shares is missing"),
-                    )
-                })?,
-        };
-        if !owner.is_readable() {
-            return Err(Error::unsupported(format!(
-                "grids of type '{}' (grid '{}')",
-                info.grid_type, info.unique_name
-            )));
+            .ok_or_else(|| Error::Misuse(format!("there is no grid {index}, only {}", self.grids.len())))
+    }
+
+    /// The grid that holds the tree of another: itself or the one it shares a tree with.
+    fn owner<'a>(&'a self, info: &'a GridInfo) -> Result<&'a GridInfo> {
+        let Some(name) = &info.instance_of else { return Ok(info) };
+        let owner = self.grids.iter().find(|grid| grid.unique_name == *name && grid.instance_of.is_none());
+        let owner = owner.ok_or_else(|| {
+            Error::malformed(
+                info.tree_range[0],
+                format!("the grid '{name}' that '{}' shares its tree with is missing", info.unique_name),
+            )
+        })?;
+        match owner.grid_type == info.grid_type {
+            true => Ok(owner),
+            false => Err(Error::malformed(
+                info.tree_range[0],
+                format!("the grid '{name}' that '{}' shares its tree with has another type", info.unique_name),
+            )),
         }
-        let layout = owner.layout().ok_or_else(|| Error::unsupported("this value type"))?;
-        let [begin, end] = owner.tree_range;
+    }
+
+    fn read_tree(&self, info: &GridInfo, bbox: Option<IndexBox>) -> Result<AnyTree> {
+        let unsupported =
+            || Error::unsupported(format!("grids of type '{}' (grid '{}')", info.grid_type, info.unique_name));
+        let shape = info.shape().ok_or_else(unsupported)?;
         let mut budget = Budget::new(&self.limits);
-        let len = usize::try_from(end - begin).unwrap_or(usize::MAX);
-        budget.take(len, 1, "a grid's compressed bytes")?;
-        let bytes = self.source.range(begin, len)?;
-        let mut cursor = Cursor::new(&bytes, begin);
-        let tree = read::read_float_tree(&mut cursor, owner.compression, layout, &mut budget)?;
-        Ok(Grid { info: info.clone(), tree })
+        let mut reader = Reader::new(&self.source, info.tree_range[0], info.tree_range[1])?;
+        let format = BlockFormat {
+            compression: info.compression,
+            half: info.save_float_as_half,
+            file_version: self.file_version,
+        };
+        let read = TreeRead { source: &self.source, format, shape };
+        for_value_type!(
+            info.stored_type(),
+            V => read.values::<V>(&mut reader, bbox, &mut budget).map(AnyTree::from),
+            match info.stored_type() {
+                points::VALUE_TYPE => {
+                    points::read(&self.source, &mut reader, format, shape, bbox, &mut budget).map(AnyTree::from)
+                }
+                _ => Err(unsupported()),
+            }
+        )
     }
 }
 
-fn read_header(cursor: &mut Cursor<'_>, budget: &mut Budget) -> Result<Header> {
-    if cursor.take(8, "the magic number")? != MAGIC {
-        return Err(Error::malformed(0, "this is not a VDB file: it does not begin with VDB's magic number"));
-    }
-    let file_version = cursor.u32("the file version")?;
-    if !(OLDEST_VERSION..=NEWEST_VERSION).contains(&file_version) {
-        return Err(Error::unsupported(format!(
-            "file version {file_version} (supported are {OLDEST_VERSION} to {NEWEST_VERSION})"
-        )));
-    }
-    let library_version = [cursor.u32("the library version")?, cursor.u32("the library version")?];
-    let has_offsets = cursor.u8("the header")? != 0;
-    let uuid = String::from_utf8_lossy(cursor.take(36, "the file's UUID")?).into_owned();
-    let metadata = Metadata::read(cursor, budget)?;
-    let grid_count = cursor.u32("the number of grids")?;
-    let end = cursor.offset();
-    Ok(Header { file_version, library_version, has_offsets, uuid, metadata, grid_count, end })
+/// What reading the tree of a grid takes.
+struct TreeRead<'a> {
+    source: &'a dyn Source,
+    format: BlockFormat,
+    shape: Shape,
 }
 
-fn read_descriptor(cursor: &mut Cursor<'_>) -> Result<Descriptor> {
-    // Names that several grids share carry a separator and a number.
-    let bracketed = |name: &str| match name.split_once('\x1e') {
-        Some((plain, number)) => format!("{plain}[{number}]"),
-        None => name.to_owned(),
-    };
-    let stored_name = cursor.string("a grid's name")?;
-    let stored_type = cursor.string("a grid's type")?;
-    let instance_of = cursor.string("the name of a shared grid")?;
-    let mut position = || -> Result<u64> {
-        let position = cursor.i64("the position of a grid")?;
-        u64::try_from(position).map_err(|_| cursor.malformed("the position of a grid is negative"))
-    };
-    let (grid_begin, _values_begin, grid_end) = (position()?, position()?, position()?);
-    let half = stored_type.strip_suffix(HALF_SUFFIX);
-    Ok(Descriptor {
-        unique_name: bracketed(&stored_name),
-        name: stored_name.split('\x1e').next().unwrap_or_default().to_owned(),
-        grid_type: half.unwrap_or(&stored_type).to_owned(),
-        save_float_as_half: half.is_some(),
-        instance_of: (!instance_of.is_empty()).then(|| bracketed(&instance_of)),
-        grid_begin,
-        grid_end,
-    })
-}
-
-fn read_grid_header(
-    cursor: &mut Cursor<'_>,
-    descriptor: &Descriptor,
-    budget: &mut Budget,
-) -> Result<GridInfo> {
-    let compression = Compression::read(cursor)?;
-    let metadata = Metadata::read(cursor, budget)?;
-    let transform = Transform::read(cursor)?;
-    Ok(GridInfo {
-        name: metadata.string("name").unwrap_or(&descriptor.name).to_owned(),
-        unique_name: descriptor.unique_name.clone(),
-        grid_type: descriptor.grid_type.clone(),
-        save_float_as_half: descriptor.save_float_as_half,
-        compression,
-        metadata,
-        transform,
-        instance_of: descriptor.instance_of.clone(),
-        tree_range: [cursor.offset(), cursor.offset()],
-    })
-}
-
-/// Counts what is kept of a grid's header. A byte of it becomes up to six: names are held twice and each byte
-/// that is not UTF-8 becomes three, and the smallest metadata entry has twelve bytes.
-fn take_grid_header(budget: &mut Budget, header_bytes: u64) -> Result<()> {
-    let kept_bytes = usize::try_from(header_bytes).unwrap_or(usize::MAX).saturating_mul(6);
-    // Twice for the growth of the vector of grids.
-    let info_bytes = 2 * size_of::<GridInfo>();
-    budget.take(1, kept_bytes.saturating_add(info_bytes), "the headers of all grids")
-}
-
-/// Finds the grids of a file without positions by walking through all of them.
-fn walk_stream(source: &impl Source, header: &Header, size: u64, limits: &Limits) -> Result<Vec<GridInfo>> {
-    let mut budget = Budget::new(limits);
-    // The source may have grown since it was asked for its size.
-    let len = usize::try_from(size.saturating_sub(header.end)).unwrap_or(usize::MAX);
-    budget.take(len, 1, "a file without grid positions")?;
-    let bytes = source.range(header.end, len)?;
-    let mut cursor = Cursor::new(&bytes, header.end);
-    let mut grids = Vec::new();
-    for _ in 0..header.grid_count {
-        let begin = cursor.offset();
-        let descriptor = read_descriptor(&mut cursor)?;
-        let mut info = read_grid_header(&mut cursor, &descriptor, &mut budget)?;
-        take_grid_header(&mut budget, cursor.offset() - begin)?;
-        if info.instance_of.is_none() {
-            let layout = info.layout().ok_or_else(|| {
-                Error::unsupported(format!(
-                    "a file without grid positions that holds a grid of type '{}'",
-                    info.grid_type
-                ))
-            })?;
-            read::skip_tree(&mut cursor, info.compression, layout, limits)?;
+impl TreeRead<'_> {
+    fn values<V: Value>(
+        &self,
+        reader: &mut Reader<'_>,
+        bbox: Option<IndexBox>,
+        budget: &mut Budget,
+    ) -> Result<Tree<V>> {
+        let mut tree = read::topology::<V>(reader, self.format, self.shape, budget)?;
+        if self.format.file_version < header::INSTANCES_SINCE {
+            Transform::read(reader, self.format.file_version)?;
         }
-        info.tree_range[1] = cursor.offset();
-        grids.push(info);
+        let Some(bbox) = bbox else {
+            read::leaf_values(self.source, reader, self.format, &mut tree, budget)?;
+            return Ok(tree);
+        };
+        let (wanted, values) =
+            read::leaf_values_in_box(self.source, reader, self.format, &tree, bbox, budget)?;
+        let per_leaf = V::stored_per_leaf(self.shape.leaf_voxels());
+        let leaves =
+            wanted.iter().enumerate().map(|(i, leaf)| (*leaf as usize, &values[i * per_leaf..][..per_leaf]));
+        build::clip_parts(&tree, leaves, bbox, budget.left_bytes())
     }
-    Ok(grids)
+}
+
+fn grid_of(info: &GridInfo, tree: Arc<AnyTree>) -> Grid {
+    Grid {
+        name: info.name.clone(),
+        metadata: info.metadata.clone(),
+        transform: info.transform.clone(),
+        save_float_as_half: info.save_float_as_half,
+        tree,
+    }
+}
+
+fn block_format(header: &Header, info: &GridInfo) -> BlockFormat {
+    BlockFormat {
+        compression: info.compression,
+        half: info.save_float_as_half,
+        file_version: header.file_version,
+    }
+}
+
+fn no_way_past(info: &GridInfo) -> Error {
+    Error::unsupported(format!("a file of this kind that holds a grid of type '{}'", info.grid_type))
+}
+
+/// Moves past the tree of a grid in a file without positions.
+fn skip_tree(reader: &mut Reader<'_>, info: &GridInfo, format: BlockFormat, limits: &Limits) -> Result<()> {
+    let shape = info.shape().ok_or_else(|| no_way_past(info))?;
+    let mut budget = Budget::new(limits);
+    for_value_type!(
+        info.stored_type(),
+        V => {
+            let tree = read::topology::<V>(reader, format, shape, &mut budget)?;
+            if format.file_version < header::INSTANCES_SINCE {
+                Transform::read(reader, format.file_version)?;
+            }
+            read::skip_leaf_values(reader, format, &tree.leaves)
+        },
+        match info.stored_type() {
+            points::VALUE_TYPE => points::skip(reader, format, shape, &mut budget),
+            _ => Err(no_way_past(info)),
+        }
+    )
+}
+
+/// Reads the transform of a grid from behind its topology, where old files have it.
+fn transform_behind_topology(
+    source: &dyn Source,
+    info: &GridInfo,
+    format: BlockFormat,
+    grid_end: u64,
+    limits: &Limits,
+) -> Result<Transform> {
+    let shape = info.shape().ok_or_else(|| no_way_past(info))?;
+    let mut reader = Reader::new(source, info.tree_range[0], grid_end)?;
+    let mut budget = Budget::new(limits);
+    for_value_type!(
+        info.stored_type(),
+        V => read::topology::<V>(&mut reader, format, shape, &mut budget).map(|_| ())?,
+        return Err(no_way_past(info))
+    );
+    Transform::read(&mut reader, format.file_version)
 }

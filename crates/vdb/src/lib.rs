@@ -27,28 +27,37 @@
 
 #![forbid(unsafe_code)]
 
+mod any;
 mod block;
+mod build;
 mod codec;
 mod error;
 mod file;
+mod header;
 mod limits;
 mod mask;
 mod metadata;
+pub mod points;
 mod read;
 mod source;
 mod stats;
 mod transform;
 mod tree;
+mod value;
 
+pub use any::{AnyTree, AnyVoxel, Grid};
 pub use block::Compression;
+pub use build::TreeBuilder;
 pub use error::{Error, Result};
-pub use file::{File, Grid, GridInfo};
+pub use file::File;
+pub use header::{GridInfo, NEWEST_VERSION, OLDEST_VERSION};
 pub use limits::Limits;
 pub use mask::Mask;
 pub use metadata::{MetaValue, Metadata, format_g};
 pub use source::Source;
-pub use stats::{IndexBox, Statistics};
+pub use stats::{ComponentStatistics, Histogram, IndexBox, Statistics};
 pub use transform::{Map, Matrix4, Transform};
 pub use tree::{
-    InternalNode, LEAF_VOXELS, LEVEL4, LEVEL5, Leaves, Level, RootTile, Tiles, Tree, Voxel, leaf_offset,
+    Branching, InternalNode, LEAF_VOXELS, LEVEL4, LEVEL5, Leaves, RootTile, Shape, Tiles, Tree, Voxel, leaf_offset,
 };
+pub use value::{LeafValues, PointOffset, Value, ValueMask};

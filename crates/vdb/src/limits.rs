@@ -33,6 +33,11 @@ impl Budget {
         Budget { limit_bytes: limits.max_memory_bytes, taken_bytes: 0 }
     }
 
+    /// The bytes that may still be taken.
+    pub(crate) fn left_bytes(&self) -> u64 {
+        self.limit_bytes - self.taken_bytes
+    }
+
     /// Counts `count` items of `item_bytes` each, before they are allocated.
     pub(crate) fn take(&mut self, count: usize, item_bytes: usize, what: &str) -> Result<()> {
         let needed_bytes = (count as u64).saturating_mul(item_bytes as u64).saturating_add(self.taken_bytes);

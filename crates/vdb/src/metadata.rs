@@ -7,7 +7,7 @@ use std::fmt;
 
 use crate::error::Result;
 use crate::limits::Budget;
-use crate::source::Cursor;
+use crate::source::Reader;
 
 /// One value: a type name and the bytes of the value, little-endian.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -25,6 +25,42 @@ pub struct Metadata {
 }
 
 impl Metadata {
+    /// Adds a value or replaces the one of that name.
+    pub fn insert(&mut self, name: &str, value: MetaValue) {
+        match self.entries.binary_search_by(|(key, _)| key.as_str().cmp(name)) {
+            Ok(i) => self.entries[i].1 = value,
+            Err(i) => self.entries.insert(i, (name.to_owned(), value)),
+        }
+    }
+
+    /// Removes the value of that name.
+    pub fn remove(&mut self, name: &str) -> Option<MetaValue> {
+        let i = self.entries.binary_search_by(|(key, _)| key.as_str().cmp(name)).ok()?;
+        Some(self.entries.remove(i).1)
+    }
+
+    /// The class of a grid with these metadata: `"fog volume"`, `"level set"`, `"staggered"` or `"unknown"`.
+    pub fn grid_class(&self) -> &str {
+        match self.string("class") {
+            Some(class @ ("fog volume" | "level set" | "staggered")) => class,
+            _ => "unknown",
+        }
+    }
+
+    /// How the vectors of a grid with these metadata follow its transform: one of OpenVDB's five ways, by
+    /// default `"invariant"`: not at all.
+    pub fn vector_type(&self) -> &str {
+        match self.string("vector_type") {
+            Some(
+                known @ ("covariant"
+                | "covariant normalize"
+                | "contravariant relative"
+                | "contravariant absolute"),
+            ) => known,
+            _ => "invariant",
+        }
+    }
+
     /// The value of that name.
     pub fn get(&self, name: &str) -> Option<&MetaValue> {
         self.entries
@@ -59,17 +95,19 @@ impl Metadata {
 
     /// Reads a count and that many entries. A later entry of the same name replaces an earlier one, as in
     /// OpenVDB.
-    pub(crate) fn read(cursor: &mut Cursor<'_>, budget: &mut Budget) -> Result<Self> {
-        let count = cursor.u32("a metadata count")?;
+    pub(crate) fn read(reader: &mut Reader<'_>, budget: &mut Budget) -> Result<Self> {
+        let count = reader.u32("a metadata count")?;
         let mut entries: Vec<(String, MetaValue)> = Vec::new();
         for _ in 0..count {
-            let name = cursor.string("a metadata name")?;
-            let type_name = cursor.string("a metadata type name")?;
-            let len = cursor.u32("the size of a metadata value")?;
-            let bytes = cursor.take(len as usize, "a metadata value")?;
-            // The entry itself counts twice for the growth of the vector and once more for the sorting.
+            let name = reader.string("a metadata name")?;
+            let type_name = reader.string("a metadata type name")?;
+            let len = reader.u32("the size of a metadata value")?;
+            // The entry itself counts twice for the growth of the vector and once more for the sorting, the value
+            // once more for the window of the file in which it is read.
             let entry_bytes = 3 * size_of::<(String, MetaValue)>();
-            budget.take(1, entry_bytes + 2 * (name.len() + type_name.len()) + bytes.len(), "metadata")?;
+            let value_bytes = 2 * (len as usize);
+            budget.take(1, entry_bytes + 2 * (name.len() + type_name.len()) + value_bytes, "metadata")?;
+            let bytes = reader.take(len as usize, "a metadata value")?;
             // Where OpenVDB keeps positions for its own delayed loading; of no use to anyone else.
             if name != "file_delayed_load" {
                 entries.push((name, MetaValue { type_name, bytes: bytes.to_vec() }));
@@ -84,6 +122,31 @@ impl Metadata {
 }
 
 impl MetaValue {
+    /// A `string`.
+    pub fn from_text(text: &str) -> Self {
+        MetaValue { type_name: "string".into(), bytes: text.as_bytes().to_vec() }
+    }
+
+    /// A `bool`.
+    pub fn from_bool(value: bool) -> Self {
+        MetaValue { type_name: "bool".into(), bytes: vec![value.into()] }
+    }
+
+    /// An `int64`.
+    pub fn from_int64(value: i64) -> Self {
+        MetaValue { type_name: "int64".into(), bytes: value.to_le_bytes().to_vec() }
+    }
+
+    /// A `float`.
+    pub fn from_float(value: f32) -> Self {
+        MetaValue { type_name: "float".into(), bytes: value.to_le_bytes().to_vec() }
+    }
+
+    /// A `vec3i`.
+    pub fn from_vec3i(value: [i32; 3]) -> Self {
+        MetaValue { type_name: "vec3i".into(), bytes: value.iter().flat_map(|c| c.to_le_bytes()).collect() }
+    }
+
     /// The text of a `string` value that is valid UTF-8.
     pub fn as_str(&self) -> Option<&str> {
         (self.type_name == "string").then(|| std::str::from_utf8(&self.bytes).ok())?

@@ -1,234 +1,420 @@
 //! Reading a tree: first its topology, then its values.
 //!
-//! A tree is written depth first, all nodes before all leaf values. The topology is read in one pass and the
-//! value blocks of the leaves are located in a second one; with that, leaves decode independently and in
-//! parallel (feature `parallel`).
+//! A tree is written depth first, all nodes before all leaf values. The topology is read in one pass and the value
+//! blocks of the leaves are located in a second one; with that, leaves decode independently and in parallel (feature
+//! `parallel`), and those outside of a box that is asked for are passed over.
+//!
+//! What older files do otherwise stands at the places where they do it: before version 214 inner nodes interleave
+//! values and children, before 222 they store the values of tiles alone and leaves repeat their origin.
 
-use crate::block::{self, Compression, DecodeScratch, ValueLayout};
+use crate::block::{self, BlockFormat, DecodeScratch};
 use crate::error::{Error, Result};
-use crate::limits::{Budget, Limits};
+use crate::limits::Budget;
 use crate::mask::Mask;
-use crate::source::Cursor;
-use crate::tree::{InternalNode, LEAF_VOXELS, LEVEL4, LEVEL5, Leaves, Level, RootTile, Tiles, Tree};
+use crate::source::{Reader, Source};
+use crate::stats::IndexBox;
+use crate::tree::{InternalNode, Leaves, RootTile, Shape, Tiles, Tree};
+use crate::value::{LeafValues, Value};
 
-/// The shape of a tree, with where its values stand in the file.
-struct Topology<'a> {
-    background: &'a [u8],
-    root_tiles: Vec<([i32; 3], &'a [u8], bool)>,
-    nodes5: Vec<NodeShape<'a>>,
-    nodes4: Vec<NodeShape<'a>>,
-    leaf_origins: Vec<[i32; 3]>,
-    leaf_masks: Vec<[u64; 8]>,
-    /// A cursor at the value block of each leaf.
-    leaf_blocks: Vec<Cursor<'a>>,
+/// From this version on the values of inner nodes stand in one block.
+const NODE_BLOCKS_SINCE: u32 = 214;
+/// From this version on the values of bool leaves are bits.
+const BOOL_BITS_SINCE: u32 = 217;
+/// How many leaves a thread decodes at a time.
+const LEAVES_PER_TASK: usize = 64;
+/// A task whose leaves span no more than this reads them at once.
+const MAX_TASK_SPAN_BYTES: u64 = 4 << 20;
+
+/// Where the value block of a leaf stands in the file.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Span {
+    begin: u64,
+    len: u32,
 }
 
-struct NodeShape<'a> {
-    origin: [i32; 3],
-    child_mask: Mask,
-    value_mask: Mask,
-    first_child: usize,
-    /// A cursor at the block of the tile values.
-    tiles: Cursor<'a>,
-}
-
-/// Reads a float tree from its first byte to its last.
-pub(crate) fn read_float_tree(
-    cursor: &mut Cursor<'_>,
-    compression: Compression,
-    layout: ValueLayout,
+/// Reads the nodes of a tree, with the values of its tiles and the masks of its leaves, but none of their values. The
+/// reader stands at the first byte of the topology, and afterwards past its last.
+pub(crate) fn topology<V: Value>(
+    reader: &mut Reader<'_>,
+    format: BlockFormat,
+    shape: Shape,
     budget: &mut Budget,
-) -> Result<Tree> {
-    let topology = read_topology(cursor, compression, layout, budget)?;
-    let float = |bytes: &[u8]| f32::from_le_bytes(bytes.try_into().expect("a float has four bytes"));
-    let background = float(topology.background);
-
-    let mut scratch = DecodeScratch::default();
-    let mut tiles = vec![0.0; LEVEL5.slots()];
-    let mut decode_nodes = |shapes: Vec<NodeShape<'_>>, level: Level| -> Result<Vec<InternalNode>> {
-        let mut nodes = Vec::with_capacity(shapes.len());
-        for mut shape in shapes {
-            let slots = level.slots();
-            let active = shape.value_mask.count();
-            let values = &mut tiles[..slots];
-            block::parse(&mut shape.tiles, compression, layout, slots, active)?.decode_f32(
-                layout,
-                background,
-                shape.value_mask.words(),
-                values,
-                &mut scratch,
-            )?;
-            let tiles = pack_tiles(values, &shape.child_mask, background);
-            if let Tiles::PerSlot(values) = &tiles {
-                budget.take(values.len(), 4, "tile values")?;
-            }
-            let NodeShape { origin, child_mask, value_mask, first_child, .. } = shape;
-            nodes.push(InternalNode { origin, child_mask, value_mask, tiles, first_child });
-        }
-        Ok(nodes)
-    };
-    let mut nodes5 = decode_nodes(topology.nodes5, LEVEL5)?;
-    let nodes4 = decode_nodes(topology.nodes4, LEVEL4)?;
-    nodes5.sort_by_key(|node| node.origin);
-
-    let mut root_tiles: Vec<RootTile> = topology
-        .root_tiles
-        .iter()
-        .map(|(origin, value, active)| RootTile { origin: *origin, value: float(value), active: *active })
-        .collect();
-    root_tiles.sort_by_key(|tile| tile.origin);
-    let same_origin = root_tiles.windows(2).any(|pair| pair[0].origin == pair[1].origin)
-        || nodes5.windows(2).any(|pair| pair[0].origin == pair[1].origin)
-        || root_tiles.iter().any(|t| nodes5.binary_search_by_key(&t.origin, |n| n.origin).is_ok());
-    if same_origin {
-        return Err(cursor.malformed("two entries of the root stand at the same place"));
-    }
-
-    budget.take(topology.leaf_origins.len(), LEAF_VOXELS * 4, "the values of all leaves")?;
-    let values = decode_leaves(&topology.leaf_blocks, &topology.leaf_masks, |block, mask, out, scratch| {
-        let active = mask.iter().map(|word| word.count_ones() as usize).sum();
-        block::parse(&mut block.clone(), compression, layout, LEAF_VOXELS, active)?
-            .decode_f32(layout, background, mask, out, scratch)
-    })?;
-    let leaves = Leaves { origins: topology.leaf_origins, masks: topology.leaf_masks, values };
-    Ok(Tree { background, root_tiles, nodes5, nodes4, leaves })
-}
-
-/// Moves the cursor past a tree of any value type with a fixed layout.
-pub(crate) fn skip_tree(
-    cursor: &mut Cursor<'_>,
-    compression: Compression,
-    layout: ValueLayout,
-    limits: &Limits,
-) -> Result<()> {
-    read_topology(cursor, compression, layout, &mut Budget::new(limits)).map(|_| ())
-}
-
-fn read_topology<'a>(
-    cursor: &mut Cursor<'a>,
-    compression: Compression,
-    layout: ValueLayout,
-    budget: &mut Budget,
-) -> Result<Topology<'a>> {
-    let buffers = cursor.u32("the number of buffers")?;
+) -> Result<Tree<V>> {
+    let buffers = reader.u32("the number of buffers")?;
     if buffers != 1 {
         return Err(Error::unsupported(format!("trees with {buffers} buffers")));
     }
-    let background = cursor.take(layout.value_bytes, "the background value")?;
-    let tile_count = cursor.u32("the number of root tiles")?;
-    let child_count = cursor.u32("the number of root children")?;
-    let mut topology = Topology {
-        background,
-        root_tiles: Vec::new(),
-        nodes5: Vec::new(),
-        nodes4: Vec::new(),
-        leaf_origins: Vec::new(),
-        leaf_masks: Vec::new(),
-        leaf_blocks: Vec::new(),
-    };
+    let background = V::from_bytes(reader.take(V::SIZE_BYTES, "the background value")?);
+    let tile_count = reader.u32("the number of root tiles")?;
+    let child_count = reader.u32("the number of root children")?;
+    let mut tree = Tree::empty(background, shape);
     for _ in 0..tile_count {
-        let origin = read_root_origin(cursor)?;
-        let value = cursor.take(layout.value_bytes, "a root tile")?;
-        let active = cursor.u8("a root tile's state")? != 0;
-        budget.take(1, 128, "root tiles")?;
-        topology.root_tiles.push((origin, value, active));
+        let origin = root_origin(reader, shape)?;
+        let value = V::from_bytes(reader.take(V::SIZE_BYTES, "a root tile")?);
+        let active = reader.u8("a root tile's state")? != 0;
+        // Twice for the growth of the vector.
+        budget.take(2, size_of::<RootTile<V>>(), "root tiles")?;
+        tree.root_tiles.push(RootTile { origin, value, active });
     }
+    let mut walk = Walk { reader, format, budget, tree: &mut tree, scratch: DecodeScratch::default() };
     for _ in 0..child_count {
-        let origin = read_root_origin(cursor)?;
-        let first_child = topology.nodes4.len();
-        let node5 = read_node(cursor, compression, layout, LEVEL5, origin, first_child, budget)?;
-        for slot in node5.child_mask.iter() {
-            let origin = LEVEL5.child_origin(node5.origin, slot);
-            let first_child = topology.leaf_origins.len();
-            let node4 = read_node(cursor, compression, layout, LEVEL4, origin, first_child, budget)?;
-            budget.take(node4.child_mask.count(), 2 * (12 + 64 + size_of::<Cursor<'_>>()), "leaves")?;
-            for slot in node4.child_mask.iter() {
-                let mut mask = [0; 8];
-                cursor.mask_words(&mut mask, "a leaf's mask")?;
-                topology.leaf_origins.push(LEVEL4.child_origin(node4.origin, slot));
-                topology.leaf_masks.push(mask);
-            }
-            topology.nodes4.push(node4);
-        }
-        topology.nodes5.push(node5);
+        let origin = root_origin(walk.reader, shape)?;
+        walk.child(0, origin)?;
     }
-    topology.leaf_blocks.reserve_exact(topology.leaf_masks.len());
-    for mask in &topology.leaf_masks {
-        // Each leaf repeats its mask before its values; the topology's counts.
-        cursor.take(64, "a leaf's mask")?;
-        topology.leaf_blocks.push(cursor.clone());
-        let active = mask.iter().map(|word| word.count_ones() as usize).sum();
-        block::parse(cursor, compression, layout, LEAF_VOXELS, active)?;
-    }
-    Ok(topology)
-}
-
-fn read_root_origin(cursor: &mut Cursor<'_>) -> Result<[i32; 3]> {
-    let origin = cursor.coord("the origin of a root entry")?;
-    match origin.iter().all(|c| c & 4095 == 0) {
-        true => Ok(origin),
-        false => Err(cursor.malformed(format!("{origin:?} is not the origin of a root entry"))),
+    tree.root_tiles.sort_by_key(|tile| tile.origin);
+    sort_root_children(&mut tree);
+    let is_child = |origin: &[i32; 3]| match tree.levels.first() {
+        Some(nodes) => nodes.binary_search_by_key(origin, |node| node.origin).is_ok(),
+        None => tree.leaves.origins.binary_search(origin).is_ok(),
+    };
+    let nodes_twice = match tree.levels.first() {
+        Some(nodes) => nodes.windows(2).any(|pair| pair[0].origin == pair[1].origin),
+        // Without inner nodes, leaves are the children, and are looked up where they stand.
+        None => !tree.leaves.origins.is_sorted_by(|a, b| a < b),
+    };
+    let same_origin = nodes_twice
+        || tree.root_tiles.windows(2).any(|pair| pair[0].origin == pair[1].origin)
+        || tree.root_tiles.iter().any(|tile| is_child(&tile.origin));
+    match same_origin {
+        true => Err(reader.malformed("two entries of the root stand at the same place")),
+        false => Ok(tree),
     }
 }
 
-fn read_node<'a>(
-    cursor: &mut Cursor<'a>,
-    compression: Compression,
-    layout: ValueLayout,
-    level: Level,
-    origin: [i32; 3],
-    first_child: usize,
+/// OpenVDB writes the children of the root in order, and so does everyone who wants to be read by it. Where they are
+/// not, the vectors of the other levels stay as they are: nodes know where their children begin.
+fn sort_root_children<V: Value>(tree: &mut Tree<V>) {
+    if let Some(nodes) = tree.levels.first_mut() {
+        nodes.sort_by_key(|node| node.origin);
+    }
+}
+
+/// Reads the values of all leaves of a tree whose topology has been read: `values` of [`Leaves`] is filled. The
+/// reader stands at the first byte behind the topology.
+pub(crate) fn leaf_values<V: Value>(
+    source: &dyn Source,
+    reader: &mut Reader<'_>,
+    format: BlockFormat,
+    tree: &mut Tree<V>,
     budget: &mut Budget,
-) -> Result<NodeShape<'a>> {
-    let words = level.slots() / 64;
-    // Twice for the growth of the vector of nodes.
-    budget.take(2 * words, Mask::BYTES_PER_WORD, "nodes")?;
-    budget.take(2, size_of::<NodeShape<'_>>() + size_of::<InternalNode>(), "nodes")?;
-    let mut masks = [vec![0; words], vec![0; words]];
-    for mask in &mut masks {
-        cursor.mask_words(mask, "a node's mask")?;
-    }
-    let [child_mask, value_mask] = masks.map(|mask| Mask::new(mask.into()));
-    let tiles = cursor.clone();
-    block::parse(cursor, compression, layout, level.slots(), value_mask.count())?;
-    Ok(NodeShape { origin, child_mask, value_mask, first_child, tiles })
+) -> Result<()> {
+    let spans = locate_leaves::<V>(reader, format, &tree.leaves, None, budget)?;
+    let all: Vec<u32> = Vec::new();
+    tree.leaves.values = decode_leaves(source, format, tree, &all, &spans, budget)?;
+    Ok(())
 }
 
-/// One value if all tiles agree on it to the bit, else all of them.
-fn pack_tiles(values: &[f32], child_mask: &Mask, background: f32) -> Tiles {
-    let mut tiles = (0..values.len()).filter(|slot| !child_mask.contains(*slot)).map(|slot| values[slot]);
-    let Some(first) = tiles.next() else { return Tiles::Uniform(background) };
-    match tiles.all(|value| value.to_bits() == first.to_bits()) {
-        true => Tiles::Uniform(first),
-        false => Tiles::PerSlot(values.into()),
+/// Reads the values of the leaves that touch a box. Gives those leaves by number and their values in that order.
+pub(crate) fn leaf_values_in_box<V: Value>(
+    source: &dyn Source,
+    reader: &mut Reader<'_>,
+    format: BlockFormat,
+    tree: &Tree<V>,
+    bbox: IndexBox,
+    budget: &mut Budget,
+) -> Result<(Vec<u32>, Vec<V::Stored>)> {
+    let last = (1 << tree.shape.leaf_log2()) - 1;
+    let touches = |origin: &[i32; 3]| {
+        (0..3).all(|i| origin[i] <= bbox[1][i] && bbox[0][i] <= origin[i].saturating_add(last))
+    };
+    let count = tree.leaves.origins.iter().filter(|origin| touches(origin)).count();
+    budget.take(count, 4, "leaves")?;
+    let origins = tree.leaves.origins.iter().enumerate();
+    let wanted: Vec<u32> = origins.filter(|(_, o)| touches(o)).map(|(i, _)| i as u32).collect();
+    let spans = locate_leaves::<V>(reader, format, &tree.leaves, Some(&wanted), budget)?;
+    let values = decode_leaves(source, format, tree, &wanted, &spans, budget)?;
+    Ok((wanted, values))
+}
+
+/// Moves past the values of all leaves.
+pub(crate) fn skip_leaf_values<V: Value>(
+    reader: &mut Reader<'_>,
+    format: BlockFormat,
+    leaves: &Leaves<V>,
+) -> Result<()> {
+    (0..leaves.len()).try_for_each(|i| skip_leaf(reader, format, leaves, i).map(|_| ()))
+}
+
+/// The state of reading a topology.
+struct Walk<'r, 'a, V: Value> {
+    reader: &'r mut Reader<'a>,
+    format: BlockFormat,
+    budget: &'r mut Budget,
+    tree: &'r mut Tree<V>,
+    scratch: DecodeScratch<V>,
+}
+
+impl<V: Value> Walk<'_, '_, V> {
+    /// Reads a child of the given depth, 0 for a child of the root, and what is below it.
+    fn child(&mut self, depth: usize, origin: [i32; 3]) -> Result<()> {
+        if depth == self.tree.shape.inner_levels() { self.leaf(origin) } else { self.node(depth, origin) }
+    }
+
+    fn leaf(&mut self, origin: [i32; 3]) -> Result<()> {
+        let leaves = &mut self.tree.leaves;
+        grow(&mut leaves.origins, 1, self.budget)?;
+        grow(&mut leaves.masks, leaves.leaf_voxels.div_ceil(64), self.budget)?;
+        self.reader.mask_words(leaves.leaf_voxels, &mut leaves.masks, "a leaf's mask")?;
+        leaves.origins.push(origin);
+        Ok(())
+    }
+
+    fn node(&mut self, depth: usize, origin: [i32; 3]) -> Result<()> {
+        let branching = self.tree.shape.branching(depth);
+        let slots = branching.slots();
+        let words = slots.div_ceil(64);
+        self.budget.take(2 * words, Mask::BYTES_PER_WORD, "nodes")?;
+        let mut masks = [Vec::with_capacity(words), Vec::with_capacity(words)];
+        for mask in &mut masks {
+            self.reader.mask_words(slots, mask, "a node's mask")?;
+        }
+        let [child_mask, value_mask] = masks.map(|mask| Mask::new(mask.into(), slots));
+        let first_child = match self.tree.levels.get(depth + 1) {
+            Some(nodes) => nodes.len(),
+            None => self.tree.leaves.len(),
+        };
+        let background = self.tree.background;
+        let interleaved = self.format.file_version < NODE_BLOCKS_SINCE;
+        let tiles = if interleaved {
+            Tiles::Uniform(background)
+        } else {
+            self.tiles(&child_mask, &value_mask, slots)?
+        };
+        let children = child_mask.clone();
+        let nodes = &mut self.tree.levels[depth];
+        grow(nodes, 1, self.budget)?;
+        let index = nodes.len();
+        nodes.push(InternalNode { origin, child_mask, value_mask, tiles, first_child });
+        if !interleaved {
+            return children
+                .iter()
+                .try_for_each(|slot| self.child(depth + 1, branching.child_origin(origin, slot)));
+        }
+        let mut values = vec![background; slots];
+        for (slot, value) in values.iter_mut().enumerate() {
+            match children.contains(slot) {
+                true => self.child(depth + 1, branching.child_origin(origin, slot))?,
+                false => *value = V::from_bytes(self.reader.take(V::SIZE_BYTES, "a tile")?),
+            }
+        }
+        self.tree.levels[depth][index].tiles = self.pack(&values, &children)?;
+        Ok(())
+    }
+
+    /// Reads the block of a node's tiles.
+    fn tiles(&mut self, child_mask: &Mask, value_mask: &Mask, slots: usize) -> Result<Tiles<V>> {
+        let background = self.tree.background;
+        let mut values = vec![background; slots];
+        if self.format.has_inactive_values() {
+            let block = block::parse::<V>(self.reader, self.format, slots, value_mask.count())?;
+            let end = self.reader.offset();
+            let mask = value_mask.words();
+            block.decode(self.reader, self.format, background, mask, &mut values, &mut self.scratch)?;
+            self.reader.seek(end);
+        } else {
+            // The values of the slots that are no children, and no others.
+            let count = slots - child_mask.count();
+            let block = block::parse::<V>(self.reader, self.format, count, count)?;
+            let mut packed = vec![background; count];
+            block.decode(self.reader, self.format, background, &[], &mut packed, &mut self.scratch)?;
+            let tiles = values.iter_mut().enumerate().filter(|(slot, _)| !child_mask.contains(*slot));
+            tiles.zip(packed).for_each(|((_, value), stored)| *value = stored);
+        }
+        self.pack(&values, child_mask)
+    }
+
+    fn pack(&mut self, values: &[V], child_mask: &Mask) -> Result<Tiles<V>> {
+        let tiles = Tiles::pack(values, child_mask, self.tree.background);
+        if let Tiles::PerSlot(values) = &tiles {
+            self.budget.take(values.len(), size_of::<V>(), "tile values")?;
+        }
+        Ok(tiles)
     }
 }
 
-/// Decodes the blocks of all leaves, 512 values each.
-fn decode_leaves<'a>(
-    blocks: &[Cursor<'a>],
-    masks: &[[u64; 8]],
-    decode: impl Fn(&Cursor<'a>, &[u64; 8], &mut [f32], &mut DecodeScratch) -> Result<()> + Sync,
-) -> Result<Vec<f32>> {
-    let mut values = vec![0.0; blocks.len() * LEAF_VOXELS];
+/// Makes room for more items, by an eighth of what is there and not twofold: for masks this is most of the memory.
+fn grow<T>(items: &mut Vec<T>, more: usize, budget: &mut Budget) -> Result<()> {
+    if items.capacity() - items.len() < more {
+        let added = (items.len() / 8).max(more).max(16);
+        budget.take(added, size_of::<T>(), "the nodes of a tree")?;
+        items.reserve_exact(added);
+    }
+    Ok(())
+}
+
+fn root_origin(reader: &mut Reader<'_>, shape: Shape) -> Result<[i32; 3]> {
+    let at = reader.offset();
+    let origin = reader.coord("the origin of a root entry")?;
+    match shape.root_origin(origin) == origin {
+        true => Ok(origin),
+        false => Err(Error::malformed(at, format!("{origin:?} is not the origin of a root entry"))),
+    }
+}
+
+/// Finds the value blocks of all leaves, or of those that are wanted, in ascending order of their numbers.
+fn locate_leaves<V: Value>(
+    reader: &mut Reader<'_>,
+    format: BlockFormat,
+    leaves: &Leaves<V>,
+    wanted: Option<&[u32]>,
+    budget: &mut Budget,
+) -> Result<Vec<Span>> {
+    let count = wanted.map_or(leaves.len(), <[u32]>::len);
+    budget.take(count, size_of::<Span>(), "leaves")?;
+    let mut spans = Vec::with_capacity(count);
+    let mut next = wanted.map(|wanted| wanted.iter().copied().peekable());
+    for i in 0..leaves.len() {
+        // Nothing is left to find. Of a whole grid every leaf is wanted and looked at.
+        if spans.len() == count {
+            break;
+        }
+        let span = skip_leaf(reader, format, leaves, i)?;
+        let is_wanted = next.as_mut().is_none_or(|next| next.next_if_eq(&(i as u32)).is_some());
+        if is_wanted {
+            spans.push(span);
+        }
+    }
+    Ok(spans)
+}
+
+/// Moves past what a file holds of a leaf and says where its values are.
+fn skip_leaf<V: Value>(
+    reader: &mut Reader<'_>,
+    format: BlockFormat,
+    leaves: &Leaves<V>,
+    i: usize,
+) -> Result<Span> {
+    let voxels = leaves.leaf_voxels;
+    // Each leaf repeats its mask before its values; the topology's counts.
+    reader.skip((voxels / 8) as u64, "a leaf's mask")?;
+    let bits = !matches!(V::leaf(&[]), LeafValues::Plain(_));
+    let old = !format.has_inactive_values();
+    let mut buffers = 1;
+    if bits || old {
+        reader.skip(12, "a leaf's origin")?;
+        if old && (!bits || format.file_version < BOOL_BITS_SINCE) {
+            // Signed in the file; less than one counts as one.
+            buffers = i32::from(reader.u8("a leaf's number of buffers")? as i8);
+        }
+    }
+    let begin = reader.offset();
+    let mut len = 0;
+    match V::leaf(&[]) {
+        LeafValues::Mask => {}
+        LeafValues::Bits(_) if format.file_version >= BOOL_BITS_SINCE => {
+            reader.skip((voxels / 8) as u64, "the values of a leaf")?;
+            len = reader.offset() - begin;
+        }
+        _ => {
+            let active = leaves.mask(i).iter().map(|word| word.count_ones() as usize).sum();
+            let format = leaf_format::<V>(format);
+            block::parse::<V>(reader, format, voxels, active)?;
+            len = reader.offset() - begin;
+            for _ in 1..buffers {
+                block::parse::<V>(reader, format, voxels, voxels)?;
+            }
+        }
+    }
+    // A block is at most a few times the size of its values.
+    Ok(Span { begin, len: u32::try_from(len).map_err(|_| reader.malformed("a leaf of over 4 GiB"))? })
+}
+
+/// How the blocks of leaves are written. Those of bool leaves, while there were any, were always zipped.
+fn leaf_format<V: Value>(format: BlockFormat) -> BlockFormat {
+    match V::leaf(&[]) {
+        LeafValues::Bits(_) => BlockFormat { compression: block::Compression::ZIP, ..format },
+        _ => format,
+    }
+}
+
+/// Decodes the leaves whose blocks stand at the given places: all leaves, or those of `wanted` numbers.
+fn decode_leaves<V: Value>(
+    source: &dyn Source,
+    format: BlockFormat,
+    tree: &Tree<V>,
+    wanted: &[u32],
+    spans: &[Span],
+    budget: &mut Budget,
+) -> Result<Vec<V::Stored>> {
+    let per_leaf = V::stored_per_leaf(tree.leaves.leaf_voxels);
+    budget.take(spans.len(), per_leaf * size_of::<V::Stored>(), "the values of all leaves")?;
+    let mut values = vec![V::Stored::default(); spans.len() * per_leaf];
+    if per_leaf == 0 {
+        return Ok(values);
+    }
+    let decode_some = |task: usize, out: &mut [V::Stored], scratch: &mut DecodeScratch<V>| -> Result<()> {
+        let first = task * LEAVES_PER_TASK;
+        let spans = &spans[first..spans.len().min(first + LEAVES_PER_TASK)];
+        let (Some(head), Some(tail)) = (spans.first(), spans.last()) else { return Ok(()) };
+        let end = tail.begin + u64::from(tail.len);
+        let whole = match end - head.begin {
+            span if span <= MAX_TASK_SPAN_BYTES => Some(source.range(head.begin, span as usize)?),
+            _ => None,
+        };
+        let mut reader = match &whole {
+            Some(bytes) => Reader::over(bytes, head.begin),
+            None => Reader::new(source, head.begin, end)?,
+        };
+        for (i, (out, span)) in out.chunks_mut(per_leaf).zip(spans).enumerate() {
+            let leaf = wanted.get(first + i).map_or(first + i, |leaf| *leaf as usize);
+            reader.seek(span.begin);
+            decode_leaf(&mut reader, format, tree, leaf, out, scratch)?;
+        }
+        Ok(())
+    };
     #[cfg(feature = "parallel")]
     {
         use rayon::prelude::*;
         values
-            .par_chunks_mut(LEAF_VOXELS)
-            .zip(blocks)
-            .zip(masks)
-            .with_min_len(64)
-            .try_for_each_init(DecodeScratch::default, |scratch, ((out, block), mask)| {
-                decode(block, mask, out, scratch)
+            .par_chunks_mut(LEAVES_PER_TASK * per_leaf)
+            .enumerate()
+            .try_for_each_init(DecodeScratch::default, |scratch, (task, out)| {
+                decode_some(task, out, scratch)
             })?;
     }
     #[cfg(not(feature = "parallel"))]
     {
         let mut scratch = DecodeScratch::default();
-        for ((out, block), mask) in values.chunks_mut(LEAF_VOXELS).zip(blocks).zip(masks) {
-            decode(block, mask, out, &mut scratch)?;
+        for (task, out) in values.chunks_mut(LEAVES_PER_TASK * per_leaf).enumerate() {
+            decode_some(task, out, &mut scratch)?;
         }
     }
     Ok(values)
+}
+
+/// Decodes the values of a leaf from where the reader stands.
+fn decode_leaf<V: Value>(
+    reader: &mut Reader<'_>,
+    format: BlockFormat,
+    tree: &Tree<V>,
+    leaf: usize,
+    out: &mut [V::Stored],
+    scratch: &mut DecodeScratch<V>,
+) -> Result<()> {
+    let voxels = tree.leaves.leaf_voxels;
+    let mask = tree.leaves.mask(leaf);
+    match V::leaf_mut(out) {
+        LeafValues::Mask => Ok(()),
+        LeafValues::Plain(out) => {
+            let active = mask.iter().map(|word| word.count_ones() as usize).sum();
+            let block = block::parse::<V>(reader, format, voxels, active)?;
+            block.decode(reader, format, tree.background, mask, out, scratch)
+        }
+        LeafValues::Bits(out) if format.file_version >= BOOL_BITS_SINCE => {
+            for (word, bytes) in out.iter_mut().zip(reader.take(voxels / 8, "the values of a leaf")?.chunks(8)) {
+                *word = bytes.iter().rev().fold(0, |word, byte| word << 8 | u64::from(*byte));
+            }
+            Ok(())
+        }
+        LeafValues::Bits(out) => {
+            let format = leaf_format::<V>(format);
+            let block = block::parse::<V>(reader, format, voxels, voxels)?;
+            let mut values = vec![V::default(); voxels];
+            block.decode(reader, format, tree.background, mask, &mut values, scratch)?;
+            for (offset, value) in values.iter().enumerate() {
+                out[offset / 64] |= u64::from(value.component(0) != 0.0) << (offset % 64);
+            }
+            Ok(())
+        }
+    }
 }

@@ -4,8 +4,13 @@
 //! linear ones, [`Transform::matrix`]. Matrices are stored as OpenVDB stores them: rows of a row-vector
 //! convention, so that `world = [index, 1] * matrix` and the translation is the last row.
 
+mod legacy;
+
 use crate::error::{Error, Result};
-use crate::source::Cursor;
+use crate::source::Reader;
+
+/// From this version on the box of a frustum is in floating point.
+const FLOAT_BOX_SINCE: u32 = 221;
 
 /// A 4×4 matrix in row-vector convention: `m[row][column]`, translation in `m[3]`.
 pub type Matrix4 = [[f64; 4]; 4];
@@ -83,51 +88,78 @@ impl Transform {
         })
     }
 
+    /// World space as index space.
+    pub fn identity() -> Self {
+        Transform::uniform_scale(1.0)
+    }
+
+    /// Voxels of one size along all axes, the voxel at the origin centred on the origin of the world.
+    pub fn uniform_scale(voxel_size: f64) -> Self {
+        let matrix = diagonal([voxel_size; 3], [0.0; 3]);
+        Transform { type_name: "UniformScaleMap".into(), map: Map::Linear(matrix) }
+    }
+
+    /// Any affine transform: `world = [index, 1] * matrix`.
+    pub fn affine(matrix: Matrix4) -> Self {
+        Transform { type_name: "AffineMap".into(), map: Map::Linear(matrix) }
+    }
+
     /// Reads a map's type name and the map.
-    pub(crate) fn read(cursor: &mut Cursor<'_>) -> Result<Self> {
-        let type_name = cursor.string("a transform's type name")?;
+    pub(crate) fn read(reader: &mut Reader<'_>, file_version: u32) -> Result<Self> {
+        let type_name = reader.string("a transform's type name")?;
+        if file_version < legacy::MAPS_SINCE {
+            return legacy::read(&type_name, reader);
+        }
         let map = match type_name.as_str() {
             "NonlinearFrustumMap" => {
-                let index_box = [cursor.vec3d("a frustum's box")?, cursor.vec3d("a frustum's box")?];
-                let taper = cursor.f64("a frustum's taper")?;
-                let depth = cursor.f64("a frustum's depth")?;
-                let inner = cursor.string("a frustum's linear map")?;
-                Map::Frustum { index_box, taper, depth, linear: read_linear(&inner, cursor)? }
+                let index_box = match file_version {
+                    FLOAT_BOX_SINCE.. => [reader.vec3d("a frustum's box")?, reader.vec3d("a frustum's box")?],
+                    _ => {
+                        let mut corner = || -> Result<[f64; 3]> { Ok(reader.coord("a frustum's box")?.map(f64::from)) };
+                        [corner()?, corner()?]
+                    }
+                };
+                let taper = reader.f64("a frustum's taper")?;
+                let depth = reader.f64("a frustum's depth")?;
+                let inner = reader.string("a frustum's linear map")?;
+                Map::Frustum { index_box, taper, depth, linear: read_linear(&inner, reader)? }
             }
-            _ => Map::Linear(read_linear(&type_name, cursor)?),
+            _ => Map::Linear(read_linear(&type_name, reader)?),
         };
         Ok(Transform { type_name, map })
     }
+}
+
+/// The matrix of a scale followed by a translation.
+fn diagonal(scale: [f64; 3], translation: [f64; 3]) -> Matrix4 {
+    let [x, y, z] = scale;
+    let [tx, ty, tz] = translation;
+    [[x, 0.0, 0.0, 0.0], [0.0, y, 0.0, 0.0], [0.0, 0.0, z, 0.0], [tx, ty, tz, 1.0]]
 }
 
 fn apply(m: &Matrix4, [x, y, z]: [f64; 3]) -> [f64; 3] {
     std::array::from_fn(|i| x * m[0][i] + y * m[1][i] + z * m[2][i] + m[3][i])
 }
 
-fn read_linear(type_name: &str, cursor: &mut Cursor<'_>) -> Result<Matrix4> {
-    let diagonal = |scale: [f64; 3], translation: [f64; 3]| {
-        let [x, y, z] = scale;
-        let [tx, ty, tz] = translation;
-        [[x, 0.0, 0.0, 0.0], [0.0, y, 0.0, 0.0], [0.0, 0.0, z, 0.0], [tx, ty, tz, 1.0]]
-    };
+fn read_linear(type_name: &str, reader: &mut Reader<'_>) -> Result<Matrix4> {
     // Besides the scale, OpenVDB writes four vectors that follow from it: voxel size, inverse, squared and
     // halved inverse.
-    let scale = |cursor: &mut Cursor<'_>| -> Result<[f64; 3]> {
-        let scale = cursor.vec3d("a scale")?;
-        cursor.take(4 * 24, "a scale map")?;
+    let scale = |reader: &mut Reader<'_>| -> Result<[f64; 3]> {
+        let scale = reader.vec3d("a scale")?;
+        reader.take(4 * 24, "a scale map")?;
         Ok(scale)
     };
     match type_name {
-        "ScaleMap" | "UniformScaleMap" => Ok(diagonal(scale(cursor)?, [0.0; 3])),
-        "TranslationMap" => Ok(diagonal([1.0; 3], cursor.vec3d("a translation")?)),
+        "ScaleMap" | "UniformScaleMap" => Ok(diagonal(scale(reader)?, [0.0; 3])),
+        "TranslationMap" => Ok(diagonal([1.0; 3], reader.vec3d("a translation")?)),
         "ScaleTranslateMap" | "UniformScaleTranslateMap" => {
-            let translation = cursor.vec3d("a translation")?;
-            Ok(diagonal(scale(cursor)?, translation))
+            let translation = reader.vec3d("a translation")?;
+            Ok(diagonal(scale(reader)?, translation))
         }
         "AffineMap" | "UnitaryMap" => {
             let mut matrix = [[0.0; 4]; 4];
             for value in matrix.iter_mut().flatten() {
-                *value = cursor.f64("a matrix")?;
+                *value = reader.f64("a matrix")?;
             }
             Ok(matrix)
         }
