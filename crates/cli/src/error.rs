@@ -63,7 +63,7 @@ pub(crate) fn explain(error: &nuage_vdb::Error) -> String {
         nuage_vdb::Error::Malformed { .. } => {
             "; the file is damaged, incomplete or of another format: copy or export it again"
         }
-        nuage_vdb::Error::Unsupported { .. } => "; export it as float grids with a current OpenVDB",
+        nuage_vdb::Error::Unsupported { .. } => "; export it as grids of numbers with a current OpenVDB",
         _ => "",
     };
     format!("{error}{mend}")

@@ -6,7 +6,7 @@
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 
-use nuage_vdb::{File, Source, Statistics};
+use nuage_vdb::{AnyTree, File, Histogram, Source, Statistics};
 use serde_json::Value;
 
 use crate::error::{Failure, explain};
@@ -15,8 +15,8 @@ use crate::{json, text};
 
 /// List the grids of VDB files: type, size, values, transform, metadata.
 ///
-/// Values of float grids are read and summed up; of other grids the header alone is shown. Boxes include both
-/// ends. Matrices apply to row vectors, so the last row is the translation.
+/// The values of each grid are read and summed up; of grids of a type that is not read the header alone is shown.
+/// Boxes include both ends. Matrices apply to row vectors, so the last row is the translation.
 #[derive(clap::Args)]
 pub(crate) struct Args {
     /// The files to look into
@@ -38,6 +38,9 @@ pub(crate) struct Args {
     hash: bool,
 }
 
+/// How finely values are counted.
+const HISTOGRAM_INTERVALS: usize = 32;
+
 /// What became known of a grid's voxels.
 pub(crate) enum Contents {
     /// All of this.
@@ -50,8 +53,12 @@ pub(crate) enum Contents {
 
 /// A grid's voxels, summed up.
 pub(crate) struct Decoded {
-    /// The value of everything that is not stored.
-    pub(crate) background: f32,
+    /// Whether the values are true or false and no numbers.
+    pub(crate) is_bool: bool,
+    /// The numbers of the value of everything that is not stored.
+    pub(crate) background: Vec<f64>,
+    /// How the active values are distributed, per component; none where they are not finite.
+    pub(crate) histograms: Vec<Histogram>,
     /// Counts, boxes and extremes.
     pub(crate) statistics: Statistics,
     /// Memory that the tree took, in bytes.
@@ -134,15 +141,22 @@ fn look_into<S: Source>(file: &File<S>, index: usize, with_hashes: bool) -> Cont
         return Contents::NotDecoded;
     }
     match file.read_grid(index) {
-        Ok(grid) => Contents::Decoded(Decoded {
-            background: grid.tree.background,
-            statistics: grid.tree.statistics(),
-            memory_bytes: grid.tree.memory_bytes(),
-            hashes: with_hashes.then(|| Hashes {
-                topology: grid.tree.topology_hash(),
-                leaf_values: grid.tree.leaf_value_hash(),
-            }),
-        }),
+        Ok(grid) => Contents::Decoded(decoded(&grid.tree, with_hashes)),
         Err(error) => Contents::Damaged(explain(&error)),
+    }
+}
+
+fn decoded(tree: &AnyTree, with_hashes: bool) -> Decoded {
+    let statistics = tree.statistics();
+    let ranges = statistics.min_max().unwrap_or_default();
+    let finite = ranges.iter().enumerate().filter(|(_, [min, max])| min.is_finite() && max.is_finite());
+    Decoded {
+        is_bool: matches!(tree.value_type(), "bool" | "mask"),
+        background: tree.background(),
+        histograms: finite.map(|(i, range)| tree.histogram(i, *range, HISTOGRAM_INTERVALS)).collect(),
+        memory_bytes: tree.memory_bytes(),
+        hashes: with_hashes
+            .then(|| Hashes { topology: tree.topology_hash(), leaf_values: tree.leaf_value_hash() }),
+        statistics,
     }
 }

@@ -6,7 +6,10 @@
 
 use std::path::Path;
 
-use nuage_vdb::{File, GridInfo, MetaValue, Metadata, Transform, Voxel, format_g};
+use nuage_vdb::{
+    ComponentStatistics, File, GridInfo, Histogram, MetaValue, Metadata, TileCount, Transform, Voxel,
+    format_g,
+};
 use serde_json::{Value, json};
 
 use crate::info::Contents;
@@ -49,17 +52,32 @@ pub(crate) fn grid(info: &GridInfo, contents: &Contents, with_hashes: bool) -> V
         Contents::Damaged(error) => (None, Some(error)),
     };
     let stats = decoded.map(|decoded| &decoded.statistics);
-    let [min, max] =
-        stats.and_then(|s| s.min_max).map(|ends| ends.map(|v| number(v.into()))).unwrap_or_default();
-    grid["background"] = json!(decoded.map(|d| single(d.background)));
+    let single_precision = matches!(info.value_type(), "float" | "vec3s");
+    let per_component = |value: &dyn Fn(&ComponentStatistics) -> f64| {
+        stats
+            .filter(|s| s.min_max().is_some())
+            .map_or(Value::Null, |s| components(&s.components.iter().map(value).collect::<Vec<f64>>(), false))
+    };
+    grid["background"] = decoded.map_or(Value::Null, |d| match d.is_bool {
+        true => json!(d.background == [1.0]),
+        false => components(&d.background, single_precision),
+    });
     grid["active_voxels"] = json!(stats.map(|s| s.active_voxels));
     grid["active_tiles"] = json!(stats.map(|s| s.active_tiles));
-    grid["node_counts_leaf_to_root"] = json!(stats.map(|s| s.node_counts_leaf_to_root));
+    grid["active_leaf_voxels"] = json!(stats.map(|s| s.active_leaf_voxels));
+    grid["tiles_by_depth"] = json!(stats.map(|s| tiles(&s.tiles_by_depth)));
+    grid["node_counts_leaf_to_root"] = json!(stats.map(|s| s.node_counts_leaf_to_root.clone()));
     grid["leaf_count"] = json!(stats.map(|s| s.node_counts_leaf_to_root[0]));
     grid["active_bbox"] = json!(stats.map_or_else(|| info.file_bbox(), |s| s.active_bbox));
     grid["leaf_bbox"] = json!(stats.and_then(|s| s.leaf_bbox));
-    grid["min"] = min;
-    grid["max"] = max;
+    grid["min"] = per_component(&|c| c.min);
+    grid["max"] = per_component(&|c| c.max);
+    grid["sum_active_voxels"] = per_component(&|c| c.sum);
+    let voxels = stats.map_or(0, |s| s.active_voxels) as f64;
+    grid["mean"] = per_component(&|c| c.mean(voxels));
+    grid["standard_deviation"] = per_component(&|c| c.standard_deviation(voxels));
+    grid["histogram"] = json!(decoded.map(|d| histograms(&d.histograms)));
+    grid["memory_bytes"] = json!(decoded.map(|d| d.memory_bytes));
     grid["nan_count"] = json!(stats.map(|s| s.nan_count));
     if with_hashes {
         let hashes = decoded.and_then(|decoded| decoded.hashes.as_ref());
@@ -74,8 +92,51 @@ pub(crate) fn grid(info: &GridInfo, contents: &Contents, with_hashes: bool) -> V
 }
 
 /// What a grid says of one index coordinate.
-pub(crate) fn probe(ijk: [i32; 3], voxel: Voxel) -> Value {
-    json!({ "ijk": ijk, "v": single(voxel.value), "on": voxel.active, "depth": voxel.depth })
+pub(crate) fn probe<V: nuage_vdb::Value>(ijk: [i32; 3], voxel: Voxel<V>) -> Value {
+    json!({ "ijk": ijk, "v": exact(voxel.value), "on": voxel.active, "depth": voxel.depth })
+}
+
+/// A value of any type, so that nothing of it is lost.
+pub(crate) fn exact<V: nuage_vdb::Value>(value: V) -> Value {
+    match V::NAME {
+        "bool" | "mask" => json!(value.component(0) != 0.0),
+        // Not every one is a double.
+        "int64" => {
+            let mut bytes = Vec::new();
+            value.append_to(&mut bytes);
+            json!(bytes.try_into().map(i64::from_le_bytes).ok())
+        }
+        name => {
+            let numbers: Vec<f64> = (0..V::COMPONENTS).map(|i| value.component(i)).collect();
+            components(&numbers, matches!(name, "float" | "vec3s"))
+        }
+    }
+}
+
+/// A number, or three of a vector.
+fn components(values: &[f64], single_precision: bool) -> Value {
+    let one = |x: &f64| if single_precision { single(*x as f32) } else { number(*x) };
+    match values {
+        [x] => one(x),
+        more => more.iter().map(one).collect(),
+    }
+}
+
+fn tiles(by_depth: &[TileCount]) -> Value {
+    let entry = |(depth, count): (usize, &TileCount)| {
+        let TileCount { active, inactive_not_background } = count;
+        (depth.to_string(), json!({ "active": active, "inactive_not_background": inactive_not_background }))
+    };
+    let some = by_depth.iter().enumerate().filter(|(_, count)| **count != TileCount::default());
+    Value::Object(some.map(entry).collect())
+}
+
+fn histograms(all: &[Histogram]) -> Value {
+    let one = |h: &Histogram| json!({ "range": numbers(&h.range), "counts": h.counts });
+    match all {
+        [histogram] => one(histogram),
+        more => more.iter().map(one).collect(),
+    }
 }
 
 fn header(info: &GridInfo) -> Value {
@@ -86,26 +147,13 @@ fn header(info: &GridInfo) -> Value {
         "grid_type": characters(info.grid_type.as_bytes()),
         "value_type": characters(info.value_type().as_bytes()),
         "grid_class": info.grid_class(),
-        "vector_type": vector_type(info),
+        "vector_type": info.metadata.vector_type(),
         "creator": creator.map_or_else(String::new, |value| characters(&value.bytes)),
         "save_float_as_half": info.save_float_as_half,
         "in_world_space": !info.metadata.bool("is_local_space").unwrap_or(false),
         "transform": transform(&info.transform),
         "metadata": metadata(&info.metadata),
     })
-}
-
-/// How the vectors of a grid follow its transform: one of OpenVDB's five ways, by default not at all.
-fn vector_type(info: &GridInfo) -> &str {
-    match info.metadata.string("vector_type") {
-        Some(
-            known @ ("covariant"
-            | "covariant normalize"
-            | "contravariant relative"
-            | "contravariant absolute"),
-        ) => known,
-        _ => "invariant",
-    }
 }
 
 fn transform(transform: &Transform) -> Value {

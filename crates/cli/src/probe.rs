@@ -3,7 +3,7 @@
 use std::io::{self, BufRead, BufReader, BufWriter, Read, Write};
 use std::path::PathBuf;
 
-use nuage_vdb::{Tree, Voxel, format_g};
+use nuage_vdb::{AnyTree, Value, Voxel, format_g, with_tree};
 
 use crate::error::Failure;
 use crate::grid::find_grid;
@@ -58,21 +58,34 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         probe_lines(io::stdin().lock(), &mut out, &tree, args.json)?;
     }
     for ijk in triples {
-        print(&mut out, *ijk, tree.voxel(*ijk), args.json)?;
+        with_tree!(&*tree, tree => print(&mut out, *ijk, tree.voxel(*ijk), args.json))?;
     }
     Ok(out.flush()?)
 }
 
-fn print(out: &mut impl Write, ijk: [i32; 3], voxel: Voxel, as_json: bool) -> io::Result<()> {
+fn print<V: Value>(out: &mut impl Write, ijk: [i32; 3], voxel: Voxel<V>, as_json: bool) -> io::Result<()> {
     if as_json {
         return writeln!(out, "{}", json::probe(ijk, voxel));
     }
     let [i, j, k] = ijk;
     let state = if voxel.active { "active" } else { "inactive" };
-    writeln!(out, "{i} {j} {k}  {}  {state}  {}", format_g(voxel.value.into(), 9), voxel.depth)
+    writeln!(out, "{i} {j} {k}  {}  {state}  {}", spelled(voxel.value), voxel.depth)
 }
 
-fn probe_lines(input: impl Read, out: &mut impl Write, tree: &Tree, as_json: bool) -> Result<(), Failure> {
+/// A value in enough digits to be exact; the numbers of a vector with commas between them.
+fn spelled<V: Value>(value: V) -> String {
+    let digits = if matches!(V::NAME, "float" | "vec3s" | "half") { 9 } else { 17 };
+    match V::NAME {
+        "int64" => json::exact(value).to_string(),
+        _ => {
+            let numbers: Vec<String> =
+                (0..V::COMPONENTS).map(|i| format_g(value.component(i), digits)).collect();
+            numbers.join(",")
+        }
+    }
+}
+
+fn probe_lines(input: impl Read, out: &mut impl Write, tree: &AnyTree, as_json: bool) -> Result<(), Failure> {
     let mut input = BufReader::new(input);
     let mut bytes = Vec::new();
     for line in 1.. {
@@ -93,7 +106,7 @@ fn probe_lines(input: impl Read, out: &mut impl Write, tree: &Tree, as_json: boo
             ijk => Ok(ijk),
         });
         match ijk {
-            Ok(Some(ijk)) => print(out, ijk, tree.voxel(ijk), as_json)?,
+            Ok(Some(ijk)) => with_tree!(tree, tree => print(out, ijk, tree.voxel(ijk), as_json))?,
             Ok(None) => {}
             Err(what) => {
                 out.flush()?;

@@ -204,7 +204,8 @@ fn header_box(args: &Args, path: &Path) -> Result<Option<WorldBox>, Failure> {
             }
         };
         let Some([min, max]) = bbox else { continue };
-        let transform = import::linear_transform(info).map_err(|e| Failure::file(path, e.to_string()))?;
+        let transform = import::linear_transform(&info.unique_name, &info.transform)
+            .map_err(|e| Failure::file(path, e.to_string()))?;
         let world_box = WorldBox::of_index_box(&transform, IndexBox { min: min.into(), max: max.into() });
         union = Some(union.map_or(world_box, |u| u.union(world_box)));
     }

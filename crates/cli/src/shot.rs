@@ -77,7 +77,7 @@ pub(crate) fn load<S: Source>(
     }
     let mut read = |index: usize| -> Result<Channel, String> {
         let grid = file.read_grid(index).map_err(|e| explain(&e))?;
-        let name = grid.info.unique_name.clone();
+        let name = file.grids[index].unique_name.clone();
         let (channel, report) = import::import(grid).map_err(|e| e.to_string())?;
         for message in messages(&name, &report, &channel) {
             warn(message);

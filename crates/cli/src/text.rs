@@ -3,7 +3,7 @@
 use std::io::{self, Write};
 use std::path::Path;
 
-use nuage_vdb::{File, GridInfo, IndexBox, Map, Metadata, Transform, format_g};
+use nuage_vdb::{File, GridInfo, IndexBox, Map, Metadata, Statistics, Transform, format_g};
 
 use crate::info::{Contents, Decoded};
 
@@ -45,7 +45,7 @@ pub(crate) fn grid(out: &mut impl Write, info: &GridInfo, contents: &Contents) -
             row(
                 out,
                 "values",
-                format!("not shown: values of type {} are not decoded yet", one_line(info.value_type())),
+                format!("not shown: values of type {} are not read", one_line(info.value_type())),
             )?;
             boxes(out, info, info.file_bbox(), " (from the metadata)")?;
         }
@@ -59,20 +59,33 @@ pub(crate) fn grid(out: &mut impl Write, info: &GridInfo, contents: &Contents) -
 
 fn values(out: &mut impl Write, info: &GridInfo, decoded: &Decoded) -> io::Result<()> {
     let stats = &decoded.statistics;
-    row(out, "background", number(decoded.background.into()))?;
-    match stats.min_max {
-        Some([min, max]) => {
-            row(out, "active values", format!("{} to {}", number(min.into()), number(max.into())))?
+    row(out, "background", vector_or_number(&decoded.background))?;
+    match stats.min_max() {
+        Some(ends) => {
+            let ends: [Vec<f64>; 2] = [0, 1].map(|end| ends.iter().map(|range| range[end]).collect());
+            row(
+                out,
+                "active values",
+                format!("{} to {}", vector_or_number(&ends[0]), vector_or_number(&ends[1])),
+            )?;
+            let voxels = stats.active_voxels as f64;
+            let means: Vec<f64> = stats.components.iter().map(|c| c.mean(voxels)).collect();
+            let deviations: Vec<f64> =
+                stats.components.iter().map(|c| c.standard_deviation(voxels)).collect();
+            let (mean, deviation) = (vector_or_number(&means), vector_or_number(&deviations));
+            row(out, "mean", format!("{mean}, standard deviation {deviation}"))?;
         }
         None => row(out, "active values", "none")?,
+    }
+    for (i, histogram) in decoded.histograms.iter().enumerate() {
+        row(out, if i == 0 { "histogram" } else { "" }, bars(&histogram.counts))?;
     }
     if stats.nan_count > 0 {
         row(out, "NaN values", thousands(stats.nan_count))?;
     }
     row(out, "active voxels", thousands(stats.active_voxels))?;
-    row(out, "active tiles", thousands(stats.active_tiles))?;
-    let [leaves, nodes4, nodes5, root] = stats.node_counts_leaf_to_root.map(thousands);
-    row(out, "nodes", format!("root {root}, 32³ {nodes5}, 16³ {nodes4}, leaves of 8³ {leaves}"))?;
+    row(out, "active tiles", tiles(stats))?;
+    row(out, "nodes", nodes(info, stats))?;
     boxes(out, info, stats.active_bbox, "")?;
     if let Some(bbox) = stats.leaf_bbox {
         row(out, "leaf box", index_box(bbox))?;
@@ -83,6 +96,66 @@ fn values(out: &mut impl Write, info: &GridInfo, decoded: &Decoded) -> io::Resul
         row(out, "value hash", format!("{:016x}", hashes.leaf_values))?;
     }
     Ok(())
+}
+
+/// A number, or a vector in brackets.
+fn vector_or_number(values: &[f64]) -> String {
+    match values {
+        [x] => number(*x),
+        more => vector(more),
+    }
+}
+
+/// Counts as a line of bars, as high as the logarithm of the count: the background of a smoke would hide the rest.
+fn bars(counts: &[u64]) -> String {
+    const BARS: [char; 9] = [' ', '▁', '▂', '▃', '▄', '▅', '▆', '▇', '█'];
+    let height = |count: u64| (count as f64 + 1.0).log2();
+    let highest = counts.iter().copied().map(height).fold(1.0, f64::max);
+    let bar = |count: &u64| match count {
+        0 => ' ',
+        _ => BARS[((height(*count) / highest * 8.0).ceil() as usize).clamp(1, 8)],
+    };
+    format!("|{}| (heights are logarithms)", counts.iter().map(bar).collect::<String>())
+}
+
+fn tiles(stats: &Statistics) -> String {
+    let inactive: u64 = stats.tiles_by_depth.iter().map(|count| count.inactive_not_background).sum();
+    let by_depth: Vec<String> = stats
+        .tiles_by_depth
+        .iter()
+        .enumerate()
+        .filter(|(_, count)| count.active > 0)
+        .map(|(depth, count)| format!("{} at depth {depth}", thousands(count.active)))
+        .collect();
+    let mut text = thousands(stats.active_tiles);
+    if !by_depth.is_empty() {
+        text = format!("{text} ({})", by_depth.join(", "));
+    }
+    match inactive {
+        0 => text,
+        _ => format!("{text}; {} inactive ones that differ from the background", thousands(inactive)),
+    }
+}
+
+/// How many nodes there are of each width.
+fn nodes(info: &GridInfo, stats: &Statistics) -> String {
+    let widths = info.shape().map(|shape| shape.log2_root_to_leaf().to_vec()).unwrap_or_default();
+    let mut counts = stats.node_counts_leaf_to_root.iter().rev();
+    let root = counts.next().copied().unwrap_or_default();
+    let mut texts = vec![format!("root {}", thousands(root))];
+    for (i, (count, log2)) in counts.zip(&widths).enumerate() {
+        let (width, count) = (1 << log2, thousands(*count));
+        texts.push(match i + 1 == widths.len() {
+            true => format!("leaves of {width}³ {count}"),
+            false => format!("{width}³ {count}"),
+        });
+    }
+    let dense = format!(
+        "{} dense, {} without active voxels",
+        thousands(stats.dense_leaves),
+        thousands(stats.leaves_without_active)
+    );
+    format!("{} ({dense})", texts.join(", "))
 }
 
 fn boxes(out: &mut impl Write, info: &GridInfo, bbox: Option<IndexBox>, origin: &str) -> io::Result<()> {

@@ -10,11 +10,12 @@
 //! Leaves that turn out constant become tiles, and those that are zero vanish.
 
 use std::collections::HashMap;
+use std::sync::Arc;
 
 use glam::{DAffine3, DMat3, DVec3, IVec3};
 use half::f16;
 use half::slice::HalfFloatSliceExt;
-use nuage_vdb::{Grid, GridInfo, LEVEL4, LEVEL5, Transform};
+use nuage_vdb::{Grid, LEVEL4, LEVEL5, Shape, Transform, Tree};
 use nuage_volume::brick::{BrickSummary, Bricks};
 use nuage_volume::build::{BuildError, TileSize, TreeBuilder};
 use nuage_volume::channel::{Channel, IndexBox};
@@ -32,6 +33,24 @@ const CUT_REGIONS_PER_NODE5: u64 = 64;
 /// Why a grid cannot become a channel.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum ImportError {
+    /// The values are no single numbers.
+    #[error("unsupported: grid '{grid}' holds values of type '{value_type}'; a medium is made of numbers")]
+    ValueType {
+        /// The grid.
+        grid: String,
+        /// The type of its values.
+        value_type: String,
+    },
+    /// The tree has nodes of other sizes than OpenVDB's standard ones.
+    #[error(
+        "unsupported: grid '{grid}' has a tree of type '{grid_type}'; only trees of 5_4_3 can be rendered"
+    )]
+    Shape {
+        /// The grid.
+        grid: String,
+        /// The type of the tree.
+        grid_type: String,
+    },
     /// The transform is one that straight rays cannot be taken through.
     #[error("unsupported: grid '{grid}' has a {transform}; only linear transforms can be rendered")]
     NonlinearTransform {
@@ -93,14 +112,14 @@ enum Meaning {
 }
 
 impl Meaning {
-    fn of(grid: &Grid) -> Self {
-        if grid.info.grid_class() != "level set" {
+    fn of(grid: &Grid, tree: &Tree<f32>) -> Self {
+        if grid.grid_class() != "level set" {
             return Meaning::Density;
         }
-        let background = grid.tree.background.abs();
+        let background = tree.background.abs();
         let usable = background.is_finite() && background > 0.0;
         // A level set's background is the width of its band: three voxels unless said otherwise.
-        let band = if usable { background } else { 3.0 * grid.info.transform.voxel_size()[0] as f32 };
+        let band = if usable { background } else { 3.0 * grid.transform.voxel_size()[0] as f32 };
         Meaning::LevelSet { band }
     }
 
@@ -118,11 +137,11 @@ impl Meaning {
 ///
 /// # Errors
 /// If the transform is not linear and invertible, or the tree becomes too large.
-pub fn import(grid: Grid) -> Result<(Channel, Report), ImportError> {
-    let world_from_index = linear_transform(&grid.info)?;
-    let name = grid.info.unique_name.clone();
-    let active_box = grid
-        .tree
+pub fn import(mut grid: Grid) -> Result<(Channel, Report), ImportError> {
+    let world_from_index = linear_transform(&grid.name, &grid.transform)?;
+    let name = grid.name.clone();
+    let tree = take_tree(&mut grid)?;
+    let active_box = tree
         .active_bbox()
         .map(|[min, max]| IndexBox { min: IVec3::from_array(min), max: IVec3::from_array(max) });
     let build_error = |source| ImportError::Build { grid: name.clone(), source };
@@ -130,7 +149,8 @@ pub fn import(grid: Grid) -> Result<(Channel, Report), ImportError> {
         let tree = TreeBuilder::new().finish(Bricks::F32(Vec::new())).map_err(build_error)?;
         return Ok((Channel { tree, world_from_index, active_box }, Report::default()));
     };
-    let meaning = Meaning::of(&grid);
+    let meaning = Meaning::of(&grid, &tree);
+    let may_be_half = grid.save_float_as_half && matches!(meaning, Meaning::Density);
     let mut importer = Importer {
         meaning,
         clip,
@@ -140,22 +160,35 @@ pub fn import(grid: Grid) -> Result<(Channel, Report), ImportError> {
         placed: HashMap::new(),
         cut_regions: 0,
     };
-    importer.background(&grid)?;
-    importer.tiles(&grid).map_err(build_error)?;
-    let bricks = importer.leaves(grid).map_err(build_error)?;
+    importer.background(&tree, &name)?;
+    importer.tiles(&tree).map_err(build_error)?;
+    let bricks = importer.leaves(tree, may_be_half).map_err(build_error)?;
     let tree = importer.builder.finish(bricks).map_err(build_error)?;
     Ok((Channel { tree, world_from_index, active_box }, importer.report))
 }
 
-/// The affine transform of a grid.
+/// Takes the tree out of a grid, as single-precision numbers.
+fn take_tree(grid: &mut Grid) -> Result<Tree<f32>, ImportError> {
+    let shape = grid.tree.shape();
+    if shape != Shape::STANDARD {
+        return Err(ImportError::Shape { grid: grid.name.clone(), grid_type: grid.grid_type() });
+    }
+    let value_type = grid.tree.value_type();
+    let taken = std::mem::replace(&mut grid.tree, Arc::new(Tree::empty(0.0_f32, shape).into()));
+    // A tree that others share is copied.
+    let tree = Arc::try_unwrap(taken).unwrap_or_else(|shared| (*shared).clone());
+    tree.into_float()
+        .ok_or_else(|| ImportError::ValueType { grid: grid.name.clone(), value_type: value_type.to_owned() })
+}
+
+/// The affine transform of the grid of that name.
 ///
 /// # Errors
 /// If it is not linear or cannot be inverted.
-pub fn linear_transform(info: &GridInfo) -> Result<DAffine3, ImportError> {
-    let Transform { type_name, .. } = &info.transform;
-    let rows = info.transform.matrix().ok_or_else(|| ImportError::NonlinearTransform {
-        grid: info.unique_name.clone(),
-        transform: type_name.clone(),
+pub fn linear_transform(grid: &str, transform: &Transform) -> Result<DAffine3, ImportError> {
+    let rows = transform.matrix().ok_or_else(|| ImportError::NonlinearTransform {
+        grid: grid.to_owned(),
+        transform: transform.type_name.clone(),
     })?;
     // The rows of a row-vector matrix are the images of the axes.
     let [x, y, z, translation] = rows.map(|row| DVec3::new(row[0], row[1], row[2]));
@@ -164,7 +197,7 @@ pub fn linear_transform(info: &GridInfo) -> Result<DAffine3, ImportError> {
     let spans_space = affine.matrix3.determinant().abs() > 1e-12 * x.length() * y.length() * z.length();
     match spans_space && affine.inverse().is_finite() {
         true => Ok(affine),
-        false => Err(ImportError::SingularTransform { grid: info.unique_name.clone() }),
+        false => Err(ImportError::SingularTransform { grid: grid.to_owned() }),
     }
 }
 
@@ -183,12 +216,12 @@ struct Importer {
 
 impl Importer {
     /// Fills the clip box with the background wherever the root has no entry.
-    fn background(&mut self, grid: &Grid) -> Result<(), ImportError> {
-        let tree = &grid.tree;
+    fn background(&mut self, tree: &Tree<f32>, name: &str) -> Result<(), ImportError> {
         let (min, max): (IVec3, IVec3) = (self.clip.min >> 12, self.clip.max >> 12);
         // At most 2⁶⁰: coordinates have 32 bits.
         let cells = (max - min + 1).as_i64vec3().element_product();
-        let origins = tree.nodes5.iter().map(|node| node.origin);
+        let nodes5 = &tree.levels[0];
+        let origins = nodes5.iter().map(|node| node.origin);
         let stored = origins.chain(tree.root_tiles.iter().map(|tile| tile.origin)).filter(|origin| {
             let cell: IVec3 = IVec3::from_array(*origin) >> 12;
             cell.cmpge(min).all() && cell.cmple(max).all()
@@ -201,7 +234,7 @@ impl Importer {
         if value == 0.0 {
             return Ok(());
         }
-        let name = || grid.info.unique_name.clone();
+        let name = || name.to_owned();
         if cells > MAX_BACKGROUND_CELLS {
             return Err(ImportError::Background { grid: name(), cells, limit: MAX_BACKGROUND_CELLS });
         }
@@ -209,7 +242,7 @@ impl Importer {
             for y in min.y..=max.y {
                 for z in min.z..=max.z {
                     let origin = [x << 12, y << 12, z << 12];
-                    let stored = tree.nodes5.binary_search_by_key(&origin, |n| n.origin).is_ok()
+                    let stored = nodes5.binary_search_by_key(&origin, |n| n.origin).is_ok()
                         || tree.root_tiles.binary_search_by_key(&origin, |t| t.origin).is_ok();
                     if !stored {
                         self.constant(IVec3::from_array(origin) >> 3, TileSize::Node5, value)
@@ -221,12 +254,12 @@ impl Importer {
         Ok(())
     }
 
-    fn tiles(&mut self, grid: &Grid) -> Result<(), BuildError> {
-        for tile in &grid.tree.root_tiles {
+    fn tiles(&mut self, tree: &Tree<f32>) -> Result<(), BuildError> {
+        for tile in &tree.root_tiles {
             self.tile(tile.origin, TileSize::Node5, tile.value)?;
         }
         for (nodes, level, size) in
-            [(&grid.tree.nodes5, LEVEL5, TileSize::Node4), (&grid.tree.nodes4, LEVEL4, TileSize::Brick)]
+            [(&tree.levels[0], LEVEL5, TileSize::Node4), (&tree.levels[1], LEVEL4, TileSize::Brick)]
         {
             for node in nodes {
                 for (slot, value, _) in node.tile_slots() {
@@ -305,12 +338,11 @@ impl Importer {
     }
 
     /// Adds all leaves; gives the values of all bricks.
-    fn leaves(&mut self, grid: Grid) -> Result<Bricks, BuildError> {
+    fn leaves(&mut self, tree: Tree<f32>, may_be_half: bool) -> Result<Bricks, BuildError> {
         let Importer { meaning, clip, .. } = *self;
-        let leaves = grid.tree.leaves;
+        let leaves = tree.leaves;
         let origins = leaves.origins;
         let mut values = leaves.values;
-        let may_be_half = grid.info.save_float_as_half && matches!(meaning, Meaning::Density);
         let found: Vec<Leaf> = map_leaves(&mut values, &origins, |origin, values| {
             convert_leaf(origin, values, meaning, clip, may_be_half)
         });

@@ -1,6 +1,6 @@
 //! Which grid of a file a user means.
 
-use nuage_vdb::{File, GridInfo, Source};
+use nuage_vdb::{File, GridInfo, Shape, Source};
 
 /// Why no grid was found.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -39,8 +39,11 @@ pub fn named_grid<S: Source>(file: &File<S>, name: &str) -> Result<usize, Select
 /// # Errors
 /// If the file has no float grid.
 pub fn density_grid<S: Source>(file: &File<S>) -> Result<usize, SelectError> {
+    let is_number = |grid: &GridInfo| {
+        matches!(grid.value_type(), "float" | "half" | "double") && grid.shape() == Some(Shape::STANDARD)
+    };
     let first = |wanted: &dyn Fn(&GridInfo) -> bool| {
-        file.grids.iter().position(|grid| grid.is_readable() && wanted(grid))
+        file.grids.iter().position(|grid| is_number(grid) && wanted(grid))
     };
     first(&|grid| grid.name == "density")
         .or_else(|| first(&|grid| grid.grid_class() == "fog volume"))

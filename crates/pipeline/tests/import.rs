@@ -2,6 +2,7 @@
 
 use std::path::Path;
 use std::process::Command;
+use std::sync::Arc;
 use std::time::Instant;
 
 use glam::{DVec3, IVec3};
@@ -9,7 +10,8 @@ use half::f16;
 use nuage_pipeline::import::{ImportError, Report, import};
 use nuage_testkit as testkit;
 use nuage_vdb::{
-    File, Grid, LEAF_VOXELS, LEVEL4, LEVEL5, Leaves, Map, Matrix4, RootTile, Tiles, Tree, leaf_offset,
+    AnyTree, File, Grid, LEAF_VOXELS, LEVEL4, LEVEL5, Leaves, Map, Matrix4, RootTile, Shape, Tiles, Tree,
+    leaf_offset,
 };
 use nuage_volume::accessor::Accessor;
 use nuage_volume::brick::{Bounds, Bricks};
@@ -23,7 +25,7 @@ type Box3 = [[i32; 3]; 2];
 
 /// What a grid means as a medium, restated: one voxel at a time, from the rules alone.
 struct Rules {
-    tree: Tree,
+    tree: Tree<f32>,
     /// The depth at which the fog of a level set is full; `None` for densities.
     band: Option<f32>,
     active_box: Option<Box3>,
@@ -31,15 +33,16 @@ struct Rules {
 
 impl Rules {
     fn of(grid: &Grid) -> Self {
-        let background = grid.tree.background.abs();
+        let tree = grid.tree.as_float().unwrap();
+        let background = tree.background.abs();
         let band = match background > 0.0 && background < f32::INFINITY {
             true => background,
-            false => 3.0 * grid.info.transform.voxel_size()[0] as f32,
+            false => 3.0 * grid.transform.voxel_size()[0] as f32,
         };
         Rules {
-            tree: grid.tree.clone(),
-            band: (grid.info.grid_class() == "level set").then_some(band),
-            active_box: grid.tree.statistics().active_bbox,
+            tree: tree.clone(),
+            band: (grid.grid_class() == "level set").then_some(band),
+            active_box: tree.active_bbox(),
         }
     }
 
@@ -76,7 +79,7 @@ impl Rules {
                 .product()
         };
         let mut found = Vec::new();
-        for (nodes, level, size) in [(&self.tree.nodes5, LEVEL5, 128), (&self.tree.nodes4, LEVEL4, 8)] {
+        for (nodes, level, size) in [(&self.tree.levels[0], LEVEL5, 128), (&self.tree.levels[1], LEVEL4, 8)] {
             for node in nodes {
                 let reaches = |slot| voxels_inside(level.child_origin(node.origin, slot), size) > 0;
                 found
@@ -85,7 +88,7 @@ impl Rules {
         }
         let root_tiles = self.tree.root_tiles.iter().map(|tile| (tile.origin, tile.value));
         found.extend(root_tiles.filter(|(o, _)| voxels_inside(*o, 4096) > 0).map(|(_, value)| value));
-        let cells = self.tree.nodes5.iter().map(|node| node.origin);
+        let cells = self.tree.levels[0].iter().map(|node| node.origin);
         let cells = cells.chain(self.tree.root_tiles.iter().map(|tile| tile.origin));
         let stored: i128 = cells.map(|origin| voxels_inside(origin, 4096)).sum();
         let all: i128 = (0..3).map(|i| i128::from(max[i]) - i128::from(min[i]) + 1).product();
@@ -142,7 +145,7 @@ impl Random {
     fn coordinates(&mut self, rules: &Rules, count: usize) -> Vec<[i32; 3]> {
         let tree = &rules.tree;
         let [min, max] = rules.active_box.unwrap_or([[-8; 3], [8; 3]]);
-        let nodes = tree.nodes5.iter().chain(&tree.nodes4).map(|node| node.origin);
+        let nodes = tree.levels.iter().flatten().map(|node| node.origin);
         let origins: Vec<[i32; 3]> = nodes.chain(tree.root_tiles.iter().map(|t| t.origin)).collect();
         let leaves = &tree.leaves.origins;
         let one = |kind: usize| -> [i32; 3] {
@@ -220,7 +223,7 @@ fn every_float_grid_with_truth_becomes_what_the_rules_say_each_time() {
 
 fn check_against_truth(grid: Grid, want: &Value, random: &mut Random, context: &str) {
     let rules = Rules { active_box: box_of(&want["active_bbox"]), ..Rules::of(&grid) };
-    let half_is_enough = grid.info.save_float_as_half && rules.band.is_none() && rules.half_is_enough();
+    let half_is_enough = grid.save_float_as_half && rules.band.is_none() && rules.half_is_enough();
     let (channel, report) = import(grid.clone()).unwrap_or_else(|e| panic!("{context}: {e}"));
     let (again, report_again) = import(grid).unwrap();
     assert!(channel.tree == again.tree && report == report_again, "{context}: two imports differ");
@@ -293,13 +296,21 @@ fn cut_limit(error: &ImportError) -> Option<u64> {
     }
 }
 
+/// The tree of a float grid, to be changed for this grid alone.
+fn float_tree(grid: &mut Grid) -> &mut Tree<f32> {
+    match Arc::make_mut(&mut grid.tree) {
+        AnyTree::Float(tree) => tree,
+        _ => panic!("'{}' is no float grid", grid.name),
+    }
+}
+
 fn random_values(mut grid: Grid, random: &mut Random) -> Grid {
     // Few values, so that whole leaves may be constant; 0.1 is not exact in half floats, and 1e-9 and 7e4
     // lie outside of their range.
     let all =
         [0.0, -0.0, 1.0, 0.5, 0.1, -1.0, 7e4, 1e-9, f32::MAX, f32::NAN, f32::INFINITY, f32::NEG_INFINITY];
     let palette: [f32; 4] = std::array::from_fn(|_| random.pick(&all));
-    let tree = &mut grid.tree;
+    let tree = float_tree(&mut grid);
     tree.background = random.pick(&palette);
     for tile in &mut tree.root_tiles {
         tile.value = random.pick(&palette);
@@ -308,12 +319,12 @@ fn random_values(mut grid: Grid, random: &mut Random) -> Grid {
     // A cell beside the origin that may be cut by the box.
     let beside = RootTile { origin: [0, 0, -4096], value: random.pick(&palette), active: false };
     let stored =
-        |o| tree.nodes5.iter().any(|n| n.origin == o) || tree.root_tiles.iter().any(|t| t.origin == o);
+        |o| tree.levels[0].iter().any(|n| n.origin == o) || tree.root_tiles.iter().any(|t| t.origin == o);
     if !stored(beside.origin) {
         tree.root_tiles.push(beside);
         tree.root_tiles.sort_by_key(|tile| tile.origin);
     }
-    for (nodes, level) in [(&mut tree.nodes5, LEVEL5), (&mut tree.nodes4, LEVEL4)] {
+    for (nodes, level) in tree.levels.iter_mut().zip([LEVEL5, LEVEL4]) {
         for node in nodes {
             node.tiles = match random.below(3) {
                 0 => Tiles::PerSlot((0..level.slots()).map(|_| random.pick(&palette)).collect()),
@@ -325,8 +336,9 @@ fn random_values(mut grid: Grid, random: &mut Random) -> Grid {
         let constant = (random.below(3) == 0).then(|| random.pick(&palette));
         values.iter_mut().for_each(|value| *value = constant.unwrap_or_else(|| random.pick(&palette)));
         let active = random.below(LEAF_VOXELS);
-        tree.leaves.masks[leaf] = [0; 8];
-        tree.leaves.masks[leaf][active / 64] |= 1 << (active % 64);
+        let mask = &mut tree.leaves.masks[leaf * 8..(leaf + 1) * 8];
+        mask.fill(0);
+        mask[active / 64] |= 1 << (active % 64);
     }
     grid
 }
@@ -380,8 +392,9 @@ fn grids_saved_as_half_stay_half_where_that_is_exact() {
         // One value that a half float cannot hold makes all of them full floats.
         for value in [0.1, 65520.0, 1e-9, f32::INFINITY] {
             let mut grid = grid.clone();
-            let (leaf, mask) = grid.tree.leaves.masks.iter().enumerate().find(|(_, m)| m[0] != 0).unwrap();
-            grid.tree.leaves.values[leaf * LEAF_VOXELS + mask[0].trailing_zeros() as usize] = value;
+            let leaves = &mut float_tree(&mut grid).leaves;
+            let (leaf, mask) = leaves.masks.chunks(8).enumerate().find(|(_, m)| m[0] != 0).unwrap();
+            leaves.values[leaf * LEAF_VOXELS + mask[0].trailing_zeros() as usize] = value;
             let rules = Rules::of(&grid);
             let (channel, _) = import(grid).unwrap();
             assert!(!f16(&channel), "{value} in {name}");
@@ -428,9 +441,10 @@ fn a_background_counts_inside_the_box_and_ends_with_it() {
     for name in ["background_5", "background_minus"] {
         let mut grid = committed("background_nonzero", name);
         for background in [5.0, 0.1, -5.0, f32::INFINITY, f32::NAN] {
-            grid.tree.background = background;
-            for tiles in grid.tree.nodes5.iter_mut().chain(&mut grid.tree.nodes4).map(|n| &mut n.tiles) {
-                *tiles = Tiles::Uniform(background);
+            let tree = float_tree(&mut grid);
+            tree.background = background;
+            for node in tree.levels.iter_mut().flatten() {
+                node.tiles = Tiles::Uniform(background);
             }
             let rules = Rules::of(&grid);
             let [min, max] = rules.active_box.unwrap();
@@ -444,7 +458,7 @@ fn a_background_counts_inside_the_box_and_ends_with_it() {
 fn a_background_over_a_huge_box_is_refused_at_once() {
     let mut grid = committed("far_coords", "far");
     import(grid.clone()).unwrap();
-    grid.tree.background = 1e-3;
+    float_tree(&mut grid).background = 1e-3;
     let started = Instant::now();
     let error = import(grid).unwrap_err();
     assert!(started.elapsed().as_secs_f32() < 2.0);
@@ -456,22 +470,17 @@ fn a_background_over_a_huge_box_is_refused_at_once() {
 /// that background is all there is around them.
 fn background_box(min: i32, size: i32) -> Grid {
     let mut grid = committed("background_nonzero", "background_5");
-    grid.tree = Tree {
-        background: 5.0,
-        root_tiles: Vec::new(),
-        nodes5: Vec::new(),
-        nodes4: Vec::new(),
-        leaves: Leaves::default(),
-    };
+    let mut tree = Tree::empty(5.0, Shape::STANDARD);
     for corner in [min, min + size - 1] {
         let mut mask = [0; 8];
         let offset = leaf_offset([corner; 3]);
         mask[offset / 64] |= 1 << (offset % 64);
-        let Leaves { origins, masks, values } = &mut grid.tree.leaves;
+        let Leaves { origins, masks, values, .. } = &mut tree.leaves;
         origins.push([corner & !7; 3]);
-        masks.push(mask);
+        masks.extend(mask);
         values.extend([0.0; LEAF_VOXELS]);
     }
+    grid.tree = Arc::new(tree.into());
     grid
 }
 
@@ -564,9 +573,9 @@ fn transforms_that_cannot_be_inverted_are_refused() {
     let base = committed("transforms", "affine");
     let with = |change: fn(&mut Matrix4)| {
         let mut grid = base.clone();
-        let mut matrix = *grid.info.transform.matrix().unwrap();
+        let mut matrix = *grid.transform.matrix().unwrap();
         change(&mut matrix);
-        grid.info.transform.map = Map::Linear(matrix);
+        grid.transform.map = Map::Linear(matrix);
         import(grid).map(|_| ())
     };
     assert_eq!(with(|_| ()), Ok(()));
@@ -630,7 +639,7 @@ fn a_level_set_becomes_the_fog_that_openvdb_makes_of_it() {
     }
 }
 
-fn fog_by_openvdb(path: &Path, name: &str, output: &Path) -> (Tree, bool) {
+fn fog_by_openvdb(path: &Path, name: &str, output: &Path) -> (Tree<f32>, bool) {
     let grids = format!("grids={name}");
     let run = Command::new("vdb_tool")
         .args(["-quiet", "-read"])
@@ -643,6 +652,6 @@ fn fog_by_openvdb(path: &Path, name: &str, output: &Path) -> (Tree, bool) {
     assert!(run.status.success(), "{}", String::from_utf8_lossy(&run.stderr));
     let file = File::open(std::fs::read(output).unwrap()).unwrap();
     let grid = file.read_grid(0).unwrap();
-    assert_eq!(grid.info.grid_class(), "fog volume");
-    (grid.tree, grid.info.save_float_as_half)
+    assert_eq!(grid.grid_class(), "fog volume");
+    (grid.tree.as_float().unwrap().clone(), grid.save_float_as_half)
 }

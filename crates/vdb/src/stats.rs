@@ -16,6 +16,12 @@ pub struct Statistics {
     pub active_leaf_voxels: u64,
     /// Active tiles at all levels.
     pub active_tiles: u64,
+    /// Tiles by the depth at which they are stored: of the root, then of each level of inner nodes.
+    pub tiles_by_depth: Vec<TileCount>,
+    /// Leaves all of whose voxels are active.
+    pub dense_leaves: u64,
+    /// Leaves none of whose voxels is active.
+    pub leaves_without_active: u64,
     /// Nodes per level: leaves, then the levels of inner nodes upward (16³ and 32³ in the standard tree), the
     /// root.
     pub node_counts_leaf_to_root: Vec<u64>,
@@ -28,6 +34,15 @@ pub struct Statistics {
     pub components: Vec<ComponentStatistics>,
     /// Active voxels of leaves and active tiles of whose value some component is not a number.
     pub nan_count: u64,
+}
+
+/// The tiles of one depth.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct TileCount {
+    /// Active ones.
+    pub active: u64,
+    /// Inactive ones whose value is not the background's.
+    pub inactive_not_background: u64,
 }
 
 /// The active values of one component, those that are not a number left out.
@@ -48,6 +63,18 @@ impl Statistics {
     pub fn min_max(&self) -> Option<Vec<[f64; 2]>> {
         let found = self.components.iter().all(|c| c.min <= c.max);
         found.then(|| self.components.iter().map(|c| [c.min, c.max]).collect())
+    }
+}
+
+impl ComponentStatistics {
+    /// The mean over that many active voxels, those whose value is not a number not among them.
+    pub fn mean(&self, voxels: f64) -> f64 {
+        self.sum / voxels
+    }
+
+    /// The standard deviation over that many active voxels.
+    pub fn standard_deviation(&self, voxels: f64) -> f64 {
+        (self.sum_of_squares / voxels - self.mean(voxels).powi(2)).max(0.0).sqrt()
     }
 }
 
@@ -75,10 +102,13 @@ impl<V: Value> Tree<V> {
         let mut leaf_bbox = self.active_tile_bbox();
         let last = (1 << self.shape.leaf_log2()) - 1;
         let mut active_leaf_voxels = 0u64;
+        let (mut dense_leaves, mut leaves_without_active) = (0, 0);
         for (i, origin) in self.leaves.origins.iter().enumerate() {
             let mask = self.leaves.mask(i);
             let active = mask.iter().map(|word| u64::from(word.count_ones())).sum::<u64>();
             active_leaf_voxels += active;
+            dense_leaves += u64::from(active == self.leaves.leaf_voxels as u64);
+            leaves_without_active += u64::from(active == 0);
             if active > 0 {
                 grow(&mut leaf_bbox, *origin, origin.map(|c| c.wrapping_add(last)));
             }
@@ -94,12 +124,31 @@ impl<V: Value> Tree<V> {
             active_voxels: active_leaf_voxels.saturating_add(tile_voxels),
             active_leaf_voxels,
             active_tiles,
+            tiles_by_depth: self.tiles_by_depth(),
+            dense_leaves,
+            leaves_without_active,
             node_counts_leaf_to_root,
             active_bbox: self.active_bbox(),
             leaf_bbox: leaf_bbox.filter(|_| !self.leaves.is_empty()),
             components: seen.components,
             nan_count: seen.nan_count,
         }
+    }
+
+    fn tiles_by_depth(&self) -> Vec<TileCount> {
+        let mut counts = vec![TileCount::default(); self.levels.len() + 1];
+        let mut count = |depth: usize, value: V, active: bool| {
+            let TileCount { active: on, inactive_not_background: off } = &mut counts[depth];
+            *on += u64::from(active);
+            *off += u64::from(!active && !value.same_bits(self.background));
+        };
+        self.root_tiles.iter().for_each(|tile| count(0, tile.value, tile.active));
+        for (i, nodes) in self.levels.iter().enumerate() {
+            for node in nodes {
+                node.tile_slots().for_each(|(_, value, active)| count(i + 1, value, active));
+            }
+        }
+        counts
     }
 
     /// The number of active voxels, those of tiles included.

@@ -83,7 +83,8 @@ fn check_tree(tree: &AnyTree, want: &Value, context: &str) {
         None if is_single => f64::from(testkit::number(v) as f32),
         None => testkit::number(v),
     };
-    let numbers = |v: &Value| v.as_array().map_or_else(|| vec![number(v)], |v| v.iter().map(number).collect());
+    let numbers =
+        |v: &Value| v.as_array().map_or_else(|| vec![number(v)], |v| v.iter().map(number).collect());
     let same = |got: &[f64], want: &[f64]| {
         got.len() == want.len() && got.iter().zip(want).all(|(a, b)| testkit::same(*a, *b))
     };
@@ -99,6 +100,16 @@ fn check_tree(tree: &AnyTree, want: &Value, context: &str) {
     assert_eq!(stats.leaf_bbox, boxed(&want["leaf_bbox"]), "{context}");
     let counts: Vec<u64> = serde_json::from_value(want["node_counts_leaf_to_root"].clone()).unwrap();
     assert_eq!(stats.node_counts_leaf_to_root, counts, "{context}");
+    assert_eq!(stats.dense_leaves, want["dense_leaves"].as_u64().unwrap(), "{context}");
+    assert_eq!(stats.leaves_without_active, want["leaves_without_active"].as_u64().unwrap(), "{context}");
+    for (depth, count) in stats.tiles_by_depth.iter().enumerate() {
+        let want = &want["tiles_by_depth"][depth.to_string()];
+        assert_eq!(count.active, want["active"].as_u64().unwrap_or(0), "{context}");
+        let inactive = want["inactive_not_background"].as_u64().unwrap_or(0);
+        // OpenVDB takes a NaN for different from any background.
+        let nan_background = tree.background().iter().any(|x| x.is_nan());
+        assert!(count.inactive_not_background == inactive || nan_background, "{context}");
+    }
     let hex = |hash: u64| format!("{hash:016x}");
     assert_eq!(hex(tree.topology_hash()), want["fnv1a64_topology"].as_str().unwrap(), "{context}");
     // Over bits: NaN keeps its payload.
@@ -114,7 +125,9 @@ fn check_tree(tree: &AnyTree, want: &Value, context: &str) {
         None => assert_eq!(min_max, None, "{context}"),
     }
     if let Some(sums) = want.get("sum_active_voxels").filter(|_| stats.nan_count == 0) {
-        let sums = sums.as_array().map_or_else(|| vec![testkit::number(sums)], |v| v.iter().map(testkit::number).collect());
+        let sums = sums
+            .as_array()
+            .map_or_else(|| vec![testkit::number(sums)], |v| v.iter().map(testkit::number).collect());
         for (component, sum) in stats.components.iter().zip(sums) {
             let close = (component.sum - sum).abs() <= 1e-6 * sum.abs().max(component.sum_of_squares.sqrt());
             assert!(close || testkit::same(component.sum, sum), "{context}: sum {} not {sum}", component.sum);
