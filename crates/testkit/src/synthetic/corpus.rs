@@ -3,10 +3,10 @@
 use super::{ACTIVE_MASK, SyntheticFile, SyntheticGrid, SyntheticLeaf, SyntheticMetadata, SyntheticTile};
 use super::{SyntheticTransform, Value, ZIP};
 
-/// Named files: each version ZIP-compressed and, where it can be, stored plainly; half floats, booleans, vectors
-/// and integers around the versions that changed them; other tree configurations, shared trees, streams, and
-/// transforms. OpenVDB 10.0.1 reads all of them as described, but for the types `half` and `string`, which it
-/// does not know.
+/// Named files: each version ZIP-compressed and, where it can be, stored plainly; half floats, booleans,
+/// vectors and integers around the versions that changed them; other tree configurations, shared trees,
+/// streams, and transforms. OpenVDB 10.0.1 reads all of them as described, but for the types `half` and
+/// `string`, which it does not know.
 pub fn corpus() -> Vec<(String, SyntheticFile)> {
     let mut corpus = Vec::new();
     let mut add = |name: String, version, compression, grids| {
