@@ -34,8 +34,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         let grids = read_all_grids(path)?;
         times_ms.push(begin.elapsed().as_secs_f64() * 1e3);
         if times_ms.len() == 1 {
-            counts =
-                (grids.len(), grids.iter().map(|grid| grid.tree.statistics().active_voxels).sum::<u64>());
+            counts = (grids.len(), grids.iter().map(|grid| grid.tree.active_voxel_count()).sum::<u64>());
         }
     }
     times_ms.sort_by(f64::total_cmp);
