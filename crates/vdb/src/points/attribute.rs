@@ -174,7 +174,8 @@ impl AttributeSet {
 
     /// The attribute that holds a group, by its position, and the bit in it.
     pub(super) fn group_bit(&self, group: &Group) -> Option<(usize, u32)> {
-        let mut holders = self.attributes.iter().enumerate().filter(|(_, attribute)| attribute.codec == "grp");
+        let mut holders =
+            self.attributes.iter().enumerate().filter(|(_, attribute)| attribute.codec == "grp");
         let (position, _) = holders.nth(usize::try_from(group.bit / 8).ok()?)?;
         Some((position, (group.bit % 8) as u32))
     }

@@ -38,7 +38,11 @@ pub(super) struct Page {
 }
 
 /// Reads the sizes of the pages of a column.
-pub(super) fn page_sizes(reader: &mut Reader<'_>, arrays: &[Array], budget: &mut Budget) -> Result<Vec<Page>> {
+pub(super) fn page_sizes(
+    reader: &mut Reader<'_>,
+    arrays: &[Array],
+    budget: &mut Budget,
+) -> Result<Vec<Page>> {
     let mut pages = Vec::new();
     let mut left = 0;
     for array in arrays.iter().filter(|array| array.is_paged() && array.bytes() > 0) {
