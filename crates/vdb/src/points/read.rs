@@ -1,9 +1,9 @@
 //! Reading a tree of points: several passes over its leaves.
 //!
-//! Behind the topology stands the number of passes, 4 and two more per attribute. Pass 0 holds the sizes of the
-//! voxels' offsets, pass 1 what attributes there are and the metadata of their arrays, then one pass per attribute
-//! the sizes of its pages, then one for the offsets, and again one per attribute for its arrays. The last is empty.
-//! Everything is located first and decoded afterwards.
+//! Behind the topology stands the number of passes, 4 and two more per attribute. Pass 0 holds the sizes of
+//! the voxels' offsets, pass 1 what attributes there are and the metadata of their arrays, then one pass per
+//! attribute the sizes of its pages, then one for the offsets, and again one per attribute for its arrays.
+//! The last is empty. Everything is located first and decoded afterwards.
 //!
 //! Layout as in OpenVDB's `points/PointDataGrid.h`, `AttributeSet.cc` and `AttributeArray.h`.
 
