@@ -1,8 +1,8 @@
 //! Attributes of points: what they are, and the arrays that hold their values.
 //!
-//! Arrays keep the bytes of the file, in the coding of the file, and are decoded when asked for: a position takes
-//! three bytes in the narrowest coding and twenty-four as doubles. Codings that are not known here keep their
-//! bytes all the same.
+//! Arrays keep the bytes of the file, in the coding of the file, and are decoded when asked for: a position
+//! takes three bytes in the narrowest coding and twenty-four as doubles. Codings that are not known here keep
+//! their bytes all the same.
 //!
 //! Layouts and codings are those of OpenVDB's `points/AttributeArray.h` and `math/QuantizedUnitVec.h`.
 
@@ -28,9 +28,9 @@ pub struct Attribute {
     pub name: String,
     /// The type of the values as files name it: `float`, `vec3s`, `quatd`, …
     pub value_type: String,
-    /// How values are coded: `null` as they are, `trnc` in half width, `fxpt8` and `fxpt16` as parts of the unit
-    /// interval around 0, `ufxpt8` and `ufxpt16` of that from 0 to 1, `uvec` as a direction in two bytes, `grp`
-    /// as bits of groups, `str` as numbers of texts.
+    /// How values are coded: `null` as they are, `trnc` in half width, `fxpt8` and `fxpt16` as parts of the
+    /// unit interval around 0, `ufxpt8` and `ufxpt16` of that from 0 to 1, `uvec` as a direction in two
+    /// bytes, `grp` as bits of groups, `str` as numbers of texts.
     pub codec: String,
 }
 
@@ -174,7 +174,8 @@ impl AttributeSet {
 
     /// The attribute that holds a group, by its position, and the bit in it.
     pub(super) fn group_bit(&self, group: &Group) -> Option<(usize, u32)> {
-        let mut holders = self.attributes.iter().enumerate().filter(|(_, attribute)| attribute.codec == "grp");
+        let mut holders =
+            self.attributes.iter().enumerate().filter(|(_, attribute)| attribute.codec == "grp");
         let (position, _) = holders.nth(usize::try_from(group.bit / 8).ok()?)?;
         Some((position, (group.bit % 8) as u32))
     }

@@ -1,8 +1,8 @@
 //! Grids of points: positions and other attributes, sorted into the leaves of a tree.
 //!
-//! A leaf holds an array per attribute; the values of its voxels say where the points of each voxel end in those
-//! arrays. Here is what can be asked of such a tree. What an attribute is and how its values are coded lives in
-//! `attribute`; how all of it stands in a file, in `read` and `paged`.
+//! A leaf holds an array per attribute; the values of its voxels say where the points of each voxel end in
+//! those arrays. Here is what can be asked of such a tree. What an attribute is and how its values are coded
+//! lives in `attribute`; how all of it stands in a file, in `read` and `paged`.
 
 mod attribute;
 mod paged;
@@ -105,8 +105,8 @@ impl PointTree {
         Some(GroupMembers { array: self.array(leaf, position)?, bit })
     }
 
-    /// The positions of the points of a leaf in index space, in the order of its arrays. `None` if the leaf has
-    /// no attribute `P` of three floating-point numbers.
+    /// The positions of the points of a leaf in index space, in the order of its arrays. `None` if the leaf
+    /// has no attribute `P` of three floating-point numbers.
     ///
     /// # Panics
     /// If there are not that many leaves.

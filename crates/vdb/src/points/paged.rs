@@ -1,8 +1,9 @@
 //! Where the bytes of point data stand in a file, and getting them from there.
 //!
-//! Arrays of attributes are small, so that OpenVDB gathers those of many leaves into pages of about a megabyte
-//! before it compresses them; the sizes of all pages stand before the first. Without compression each array stands
-//! on its own. Either way a column of arrays becomes a list of [`Piece`]s that decode independently.
+//! Arrays of attributes are small, so that OpenVDB gathers those of many leaves into pages of about a
+//! megabyte before it compresses them; the sizes of all pages stand before the first. Without compression
+//! each array stands on its own. Either way a column of arrays becomes a list of [`Piece`]s that decode
+//! independently.
 //!
 //! Layout as in OpenVDB's `points/StreamCompression.cc`.
 
@@ -38,7 +39,11 @@ pub(super) struct Page {
 }
 
 /// Reads the sizes of the pages of a column.
-pub(super) fn page_sizes(reader: &mut Reader<'_>, arrays: &[Array], budget: &mut Budget) -> Result<Vec<Page>> {
+pub(super) fn page_sizes(
+    reader: &mut Reader<'_>,
+    arrays: &[Array],
+    budget: &mut Budget,
+) -> Result<Vec<Page>> {
     let mut pages = Vec::new();
     let mut left = 0;
     for array in arrays.iter().filter(|array| array.is_paged() && array.bytes() > 0) {
@@ -113,8 +118,8 @@ pub(super) fn locate(
     Ok(pieces)
 }
 
-/// Decodes pieces, one after the other in memory as in the list. `worked_bytes` is what the budget has been asked
-/// for working memory so far.
+/// Decodes pieces, one after the other in memory as in the list. `worked_bytes` is what the budget has been
+/// asked for working memory so far.
 pub(super) fn decode(
     source: &dyn Source,
     pieces: &[Piece],
@@ -210,10 +215,11 @@ impl Piece {
     /// Decodes the piece from what is stored of it.
     pub(super) fn decode(&self, stored: &[u8], out: &mut [u8], scratch: &mut Scratch) -> Result<()> {
         if !self.is_compressed {
-            return match stored.len() == out.len() {
-                true => Ok(out.copy_from_slice(stored)),
-                false => Err(Error::malformed(self.at, "an array of another size than its values")),
-            };
+            if stored.len() != out.len() {
+                return Err(Error::malformed(self.at, "an array of another size than its values"));
+            }
+            out.copy_from_slice(stored);
+            return Ok(());
         }
         let chunk_bytes = stored.get(4..8).and_then(|size| size.try_into().ok()).map(u32::from_le_bytes);
         let is_padded = out.len() < PADDED_BYTES && chunk_bytes == Some(PADDED_BYTES as u32);

@@ -1,9 +1,9 @@
 //! Reading a tree of points: several passes over its leaves.
 //!
-//! Behind the topology stands the number of passes, 4 and two more per attribute. Pass 0 holds the sizes of the
-//! voxels' offsets, pass 1 what attributes there are and the metadata of their arrays, then one pass per attribute
-//! the sizes of its pages, then one for the offsets, and again one per attribute for its arrays. The last is empty.
-//! Everything is located first and decoded afterwards.
+//! Behind the topology stands the number of passes, 4 and two more per attribute. Pass 0 holds the sizes of
+//! the voxels' offsets, pass 1 what attributes there are and the metadata of their arrays, then one pass per
+//! attribute the sizes of its pages, then one for the offsets, and again one per attribute for its arrays.
+//! The last is empty. Everything is located first and decoded afterwards.
 //!
 //! Layout as in OpenVDB's `points/PointDataGrid.h`, `AttributeSet.cc` and `AttributeArray.h`.
 
@@ -131,7 +131,10 @@ fn locate(
     let passes = reader.u16("the number of passes")?;
     let leaves = tree.leaves.len();
     if leaves > 0 && passes < OWN_PASSES {
-        return Err(Error::malformed(at, format!("points in {passes} passes, of which there are at least 4")));
+        return Err(Error::malformed(
+            at,
+            format!("points in {passes} passes, of which there are at least 4"),
+        ));
     }
     let max_attributes = usize::from(passes.saturating_sub(OWN_PASSES) / 2);
     budget.take(leaves, 2 + size_of::<Piece>() + 4, "the leaves of points")?;
@@ -169,7 +172,10 @@ fn locate_offsets(reader: &mut Reader<'_>, told: u16) -> Result<Piece> {
     let size = reader.u16("the size of a leaf's offsets")?;
     let at = reader.offset();
     if size != told {
-        return Err(Error::malformed(at, format!("the offsets of a leaf take {size} bytes, not {told} as told")));
+        return Err(Error::malformed(
+            at,
+            format!("the offsets of a leaf take {size} bytes, not {told} as told"),
+        ));
     }
     let is_compressed = size != NOT_COMPRESSED;
     let stored_bytes = if is_compressed { u32::from(size) } else { OFFSETS_BYTES as u32 };
@@ -328,7 +334,9 @@ fn read_array(reader: &mut Reader<'_>, attribute: &Attribute) -> Result<(Array, 
     let storage = reader.u8("the flags of an array")?;
     let points = reader.u32("the number of points of an array")?;
     if storage & !Array::ALL_STORAGE != 0 {
-        return Err(Error::unsupported(format!("arrays of attributes with flags {storage:#x} (at byte {at})")));
+        return Err(Error::unsupported(format!(
+            "arrays of attributes with flags {storage:#x} (at byte {at})"
+        )));
     }
     let stride = if storage & Array::STRIDED != 0 { reader.u32("the stride of an array")? } else { 1 };
     let mut array = Array { begin: 0, points, stride, value_bytes: 0, flags, storage };
