@@ -38,7 +38,7 @@ impl Compression {
     pub const BLOSC: Compression = Compression { flags: COMPRESS_BLOSC | COMPRESS_ACTIVE_MASK };
 
     /// The same with the values of inactive voxels stored too.
-    pub fn with_all_values(self) -> Self {
+    pub const fn with_all_values(self) -> Self {
         Compression { flags: self.flags & !COMPRESS_ACTIVE_MASK }
     }
 
@@ -128,9 +128,7 @@ pub(crate) fn parse<V: Value>(
     let begin = reader.offset();
     let kind = if format.has_inactive_values() { reader.u8("a block's first byte")? } else { ALL_VALUES };
     if kind > ALL_VALUES {
-        return Err(
-            Error::malformed(begin, format!("{kind} does not say how inactive values are stored")),
-        );
+        return Err(Error::malformed(begin, format!("{kind} does not say how inactive values are stored")));
     }
     let inactive_count = match kind {
         ONE_INACTIVE_VALUE | MASK_AND_ONE_INACTIVE_VALUE => 1,
@@ -168,8 +166,9 @@ pub(crate) fn parse<V: Value>(
             );
         }
         if payload_bytes > 2 * raw_bytes + MAX_COMPRESSED_SLACK {
-            return Err(reader
-                .malformed(format!("a compressed block of {payload_bytes} bytes that stands for {raw_bytes}")));
+            return Err(reader.malformed(format!(
+                "a compressed block of {payload_bytes} bytes that stands for {raw_bytes}"
+            )));
         }
     }
     let payload_at = reader.offset();

@@ -44,6 +44,7 @@ mod stats;
 mod transform;
 mod tree;
 mod value;
+mod write;
 
 pub use any::{AnyTree, AnyVoxel, Grid};
 pub use block::Compression;
@@ -58,6 +59,8 @@ pub use source::Source;
 pub use stats::{ComponentStatistics, Histogram, IndexBox, Statistics};
 pub use transform::{Map, Matrix4, Transform};
 pub use tree::{
-    Branching, InternalNode, LEAF_VOXELS, LEVEL4, LEVEL5, Leaves, RootTile, Shape, Tiles, Tree, Voxel, leaf_offset,
+    Branching, InternalNode, LEAF_VOXELS, LEVEL4, LEVEL5, Leaves, RootTile, Shape, Tiles, Tree, Voxel,
+    leaf_offset,
 };
 pub use value::{LeafValues, PointOffset, Value, ValueMask};
+pub use write::{WriteOptions, write};
