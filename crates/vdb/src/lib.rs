@@ -71,6 +71,7 @@ mod stats;
 mod transform;
 mod tree;
 mod value;
+mod write;
 
 pub use any::{AnyTree, AnyVoxel, Grid};
 pub use block::Compression;
@@ -89,3 +90,4 @@ pub use tree::{
     leaf_offset,
 };
 pub use value::{LeafValues, PointOffset, Value, ValueMask};
+pub use write::{WriteOptions, write};
