@@ -31,6 +31,7 @@ mod any;
 mod block;
 mod build;
 mod codec;
+pub mod diff;
 mod error;
 mod file;
 mod header;
@@ -43,6 +44,7 @@ mod source;
 mod stats;
 mod transform;
 mod tree;
+pub mod validate;
 mod value;
 
 pub use any::{AnyTree, AnyVoxel, Grid};
