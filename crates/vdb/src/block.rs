@@ -38,7 +38,7 @@ impl Compression {
     pub const BLOSC: Compression = Compression { flags: COMPRESS_BLOSC | COMPRESS_ACTIVE_MASK };
 
     /// The same with the values of inactive voxels stored too.
-    pub fn with_all_values(self) -> Self {
+    pub const fn with_all_values(self) -> Self {
         Compression { flags: self.flags & !COMPRESS_ACTIVE_MASK }
     }
 

@@ -2,11 +2,11 @@
 
 use std::io;
 
-/// Why a file could not be read.
+/// Why a file could not be read or written.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// The source of the bytes failed: the disk, the network, a permission.
-    #[error("cannot read the file: {0}")]
+    /// The source or the sink of the bytes failed: the disk, the network, a permission.
+    #[error("input or output failed: {0}")]
     Io(#[from] io::Error),
     /// The bytes are not a valid VDB file: truncated, damaged or not a VDB file at all.
     #[error("malformed file at byte {offset}: {what}")]

@@ -46,6 +46,7 @@ mod transform;
 mod tree;
 pub mod validate;
 mod value;
+mod write;
 
 pub use any::{AnyTree, AnyVoxel, Grid};
 pub use block::Compression;
@@ -64,3 +65,4 @@ pub use tree::{
     leaf_offset,
 };
 pub use value::{LeafValues, PointOffset, Value, ValueMask};
+pub use write::{WriteOptions, write};

@@ -51,6 +51,9 @@ pub trait Value: Copy + PartialEq + Debug + Default + Send + Sync + sealed::Seal
     /// Whether both are the same to the bit, so that NaN is the same as itself and 0 differs from −0.
     fn same_bits(self, other: Self) -> bool;
 
+    /// The value's bits as a number to hash. Of vectors, mixed.
+    fn hash_bits(self) -> u64;
+
     /// Appends the value as a file holds it, little-endian.
     fn append_to(self, bytes: &mut Vec<u8>);
 
@@ -153,6 +156,10 @@ macro_rules! number {
                 $bits(self) == $bits(other)
             }
 
+            fn hash_bits(self) -> u64 {
+                $bits(self) as u64
+            }
+
             fn append_to(self, bytes: &mut Vec<u8>) {
                 bytes.extend_from_slice(&self.to_le_bytes());
             }
@@ -168,7 +175,7 @@ macro_rules! number {
 
 /// Decoding and encoding of floats that may be saved as half floats.
 macro_rules! maybe_half {
-    ($type:ty, $to_half:expr, $decode_halves:ident) => {
+    ($type:ty, $encode_halves:ident, $decode_halves:ident) => {
         fn decode(bytes: &[u8], half: bool, out: &mut [Self]) {
             if half {
                 return $decode_halves(bytes, out);
@@ -179,21 +186,23 @@ macro_rules! maybe_half {
         }
 
         fn encode(values: &[Self], half: bool, bytes: &mut Vec<u8>) {
-            for value in values {
-                match half {
-                    true => bytes.extend_from_slice(&$to_half(*value).to_le_bytes()),
-                    false => bytes.extend_from_slice(&value.to_le_bytes()),
-                }
+            if half {
+                return $encode_halves(values, bytes);
+            }
+            let begin = bytes.len();
+            bytes.resize(begin + size_of_val(values), 0);
+            for (bytes, value) in bytes[begin..].as_chunks_mut().0.iter_mut().zip(values) {
+                *bytes = value.to_le_bytes();
             }
         }
     };
 }
 
 number!(f32, "float", 2, |x: f32| -x, f64::from, f32::to_bits, {
-    maybe_half!(f32, f16::from_f32, halves_to_f32);
+    maybe_half!(f32, f32_to_halves, halves_to_f32);
 });
 number!(f64, "double", 2, |x: f64| -x, |x: f64| x, f64::to_bits, {
-    maybe_half!(f64, f64_to_half, halves_to_f64);
+    maybe_half!(f64, f64_to_halves, halves_to_f64);
 });
 number!(f16, "half", 2, |x: f16| -x, f64::from, f16::to_bits, {
     one_by_one!();
@@ -233,6 +242,11 @@ macro_rules! vector {
 
             fn same_bits(self, other: Self) -> bool {
                 (0..3).all(|i| self[i].same_bits(other[i]))
+            }
+
+            fn hash_bits(self) -> u64 {
+                // An odd factor loses no bits of the numbers before.
+                self.iter().fold(0, |hash, x| hash.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ x.hash_bits())
             }
 
             fn append_to(self, bytes: &mut Vec<u8>) {
@@ -296,6 +310,10 @@ impl Value for bool {
         self == other
     }
 
+    fn hash_bits(self) -> u64 {
+        u64::from(self)
+    }
+
     fn append_to(self, bytes: &mut Vec<u8>) {
         bytes.push(self.into());
     }
@@ -345,6 +363,10 @@ impl Value for ValueMask {
         self == other
     }
 
+    fn hash_bits(self) -> u64 {
+        u64::from(self.0)
+    }
+
     fn append_to(self, bytes: &mut Vec<u8>) {
         self.0.append_to(bytes);
     }
@@ -378,6 +400,10 @@ impl Value for PointOffset {
         self == other
     }
 
+    fn hash_bits(self) -> u64 {
+        u64::from(self.0)
+    }
+
     fn append_to(self, bytes: &mut Vec<u8>) {
         bytes.extend_from_slice(&self.0.to_le_bytes());
     }
@@ -387,11 +413,6 @@ impl Value for PointOffset {
     }
 
     one_by_one!();
-}
-
-/// OpenVDB goes by way of a single-precision float, which can round twice.
-fn f64_to_half(x: f64) -> f16 {
-    f16::from_f32(x as f32)
 }
 
 /// Conversions are faster over runs of halves than one by one.
@@ -405,6 +426,25 @@ fn halves_to_f32(bytes: &[u8], out: &mut [f32]) {
             *half = f16::from_le_bytes(*bytes);
         }
         halves[..out.len()].convert_to_f32_slice(out);
+    }
+}
+
+fn f32_to_halves(values: &[f32], bytes: &mut Vec<u8>) {
+    use half::slice::HalfFloatSliceExt;
+    let mut halves = [f16::ZERO; HALVES_AT_ONCE];
+    for values in values.chunks(HALVES_AT_ONCE) {
+        let halves = &mut halves[..values.len()];
+        halves.convert_from_f32_slice(values);
+        bytes.extend(halves.iter().flat_map(|half| half.to_le_bytes()));
+    }
+}
+
+/// OpenVDB goes by way of a single-precision float, which can round twice.
+fn f64_to_halves(values: &[f64], bytes: &mut Vec<u8>) {
+    let mut singles = [0.0; HALVES_AT_ONCE];
+    for values in values.chunks(HALVES_AT_ONCE) {
+        singles.iter_mut().zip(values).for_each(|(single, value)| *single = *value as f32);
+        f32_to_halves(&singles[..values.len()], bytes);
     }
 }
 

@@ -1,4 +1,5 @@
-//! Blosc 1 chunks, the form in which most `.vdb` files hold their values.
+//! Blosc 1 chunks, the form in which most `.vdb` files hold their values, and their decoder. The encoder is
+//! [`super::blosc_encoder`].
 //!
 //! A chunk cuts its data into blocks, filters each block (see [`super::shuffle`]) and compresses it with
 //! one of five general codecs, as one stream or as one stream per byte of an element. All integers are
@@ -28,11 +29,11 @@ use ruzstd::decoding::{BlockDecodingStrategy, FrameDecoder};
 use super::CodecError::{Malformed, Unsupported};
 use super::{CodecError, Scratch, blosclz, shuffle, zlib};
 
-const HEADER_BYTES: usize = 16;
+pub(super) const HEADER_BYTES: usize = 16;
 /// Where a chunk may split blocks at all, it does so for elements of up to this size …
-const MAX_SPLIT_TYPESIZE: usize = 16;
+pub(super) const MAX_SPLIT_TYPESIZE: usize = 16;
 /// … if each stream of the block gets at least this many bytes.
-const MIN_SPLIT_BYTES: usize = 128;
+pub(super) const MIN_SPLIT_BYTES: usize = 128;
 /// Zstandard windows up to this size are accepted for blocks of any size, larger ones only for large blocks.
 const MIN_ZSTD_WINDOW_LIMIT: u64 = 1 << 20;
 

@@ -1,14 +1,17 @@
-//! Decoders of compressed value blocks: bytes in, bytes out.
+//! Codecs of compressed value blocks: bytes in, bytes out.
 //!
 //! A `.vdb` file compresses the values of each leaf and inner node on their own, with zlib or as a Blosc
-//! chunk. The functions here turn one such block back into exactly the bytes that the caller expects, and
-//! take no more memory than a few times that (plus a constant), whatever the block claims about itself.
+//! chunk. The decoders here turn one such block back into exactly the bytes that the caller expects, and
+//! take no more memory than a few times that (plus a constant), whatever the block claims about itself. The
+//! encoders make blocks that OpenVDB reads.
 //!
 //! What the bytes mean, which codec a grid uses and where a block starts and ends is none of their business:
-//! the readers of files and grids know that.
+//! the readers and writers of files and grids know that.
 
 pub(crate) mod blosc;
+pub(crate) mod blosc_encoder;
 mod blosclz;
+mod lz4;
 mod shuffle;
 pub(crate) mod zlib;
 
@@ -31,4 +34,14 @@ pub(crate) struct Scratch {
     shuffled: Vec<u8>,
     inflate: Option<flate2::Decompress>,
     zstd: Option<ruzstd::decoding::FrameDecoder>,
+}
+
+/// What encoders keep from block to block, for the same reason. What is left in it never changes what the next block
+/// is encoded to.
+#[derive(Default)]
+pub(crate) struct EncodeScratch {
+    /// A Blosc block after its shuffle.
+    shuffled: Vec<u8>,
+    lz4: lz4::Table,
+    deflate: Option<flate2::Compress>,
 }

@@ -1,4 +1,5 @@
-//! Undoes Blosc's two filters, which regroup a block before it is compressed.
+//! Blosc's two filters, which regroup a block before it is compressed: the byte shuffle both ways, the bit shuffle
+//! as it is undone.
 //!
 //! The byte shuffle stores byte 0 of all elements, then byte 1 of all elements, and so on. The bit shuffle
 //! does the same with bits: bit 0 of byte 0 of all elements, packed eight to a byte with the first element
@@ -56,6 +57,35 @@ fn unshuffle_4(planes: &[u8], elements: &mut [u8]) {
     }
 }
 
+/// The byte shuffle of whole elements of `typesize` bytes (at least 1). Both slices have the same length.
+pub(super) fn shuffle_bytes(typesize: usize, src: &[u8], out: &mut [u8]) {
+    let count = src.len() / typesize;
+    if count == 0 {
+        return;
+    }
+    match typesize {
+        2 => shuffle_array::<2>(src, out),
+        4 => shuffle_array::<4>(src, out),
+        8 => shuffle_array::<8>(src, out),
+        _ => {
+            for (byte, plane) in out.chunks_exact_mut(count).enumerate() {
+                for (value, element) in plane.iter_mut().zip(src.chunks_exact(typesize)) {
+                    *value = element[byte];
+                }
+            }
+        }
+    }
+}
+
+fn shuffle_array<const N: usize>(src: &[u8], out: &mut [u8]) {
+    let elements = src.as_chunks::<N>().0;
+    for (byte, plane) in out.chunks_exact_mut(elements.len()).enumerate() {
+        for (value, element) in plane.iter_mut().zip(elements) {
+            *value = element[byte];
+        }
+    }
+}
+
 /// Undoes the bit shuffle of elements of `typesize` bytes (at least 1). Both slices have the same length.
 ///
 /// Blosc 1 shuffles bits only where the number of whole elements is a multiple of 8; other blocks it leaves
@@ -101,7 +131,7 @@ mod tests {
     use super::*;
 
     /// The byte shuffle, element by element from its definition.
-    fn shuffle_bytes(typesize: usize, src: &[u8]) -> Vec<u8> {
+    fn plainly_shuffled_bytes(typesize: usize, src: &[u8]) -> Vec<u8> {
         let count = src.len() / typesize;
         let mut out = src.to_vec();
         for element in 0..count {
@@ -142,8 +172,12 @@ mod tests {
             let size = elements * typesize + rest % typesize;
             let data: Vec<u8> = seed.iter().copied().cycle().take(size).collect();
             let mut out = vec![0xa5; size];
-            unshuffle_bytes(typesize, &shuffle_bytes(typesize, &data), &mut out);
+            unshuffle_bytes(typesize, &plainly_shuffled_bytes(typesize, &data), &mut out);
             prop_assert!(out == data, "bytes, {typesize} × {elements}");
+            let whole = &data[..elements * typesize];
+            let mut shuffled = vec![0xa5; whole.len()];
+            shuffle_bytes(typesize, whole, &mut shuffled);
+            prop_assert!(shuffled == plainly_shuffled_bytes(typesize, whole), "{typesize} × {elements}");
             for size in [size, elements / 8 * 8 * typesize + rest % typesize] {
                 let mut out = vec![0xa5; size];
                 unshuffle_bits(typesize, &shuffle_bits(typesize, &data[..size]), &mut out);
