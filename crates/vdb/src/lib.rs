@@ -38,6 +38,7 @@ mod header;
 mod limits;
 mod mask;
 mod metadata;
+pub mod nano;
 pub mod points;
 mod read;
 mod source;

@@ -256,7 +256,7 @@ impl Fnv1a {
     }
 }
 
-fn grow(bbox: &mut Option<IndexBox>, min: [i32; 3], max: [i32; 3]) {
+pub(crate) fn grow(bbox: &mut Option<IndexBox>, min: [i32; 3], max: [i32; 3]) {
     let [low, high] = bbox.get_or_insert([min, max]);
     for axis in 0..3 {
         low[axis] = low[axis].min(min[axis]);
@@ -314,7 +314,7 @@ impl Seen {
 }
 
 /// Takes in the active voxels of a leaf.
-fn grow_to_leaf(bbox: &mut Option<IndexBox>, origin: [i32; 3], mask: &[u64], log2: u32) {
+pub(crate) fn grow_to_leaf(bbox: &mut Option<IndexBox>, origin: [i32; 3], mask: &[u64], log2: u32) {
     let mut local: Option<IndexBox> = None;
     if log2 == 3 {
         // One word is a slab of constant x; its bytes are rows of constant y.
