@@ -317,6 +317,38 @@ fn skip_tree(reader: &mut Reader<'_>, info: &GridInfo, format: BlockFormat, limi
     )
 }
 
+/// What walking through the tree of a grid shows besides its values.
+pub(crate) struct Walked {
+    /// Where the tree ends.
+    pub(crate) end: u64,
+    /// Position and origin of the first leaf whose mask stands differently before its values.
+    pub(crate) contrary_mask: Option<(u64, [i32; 3])>,
+}
+
+/// Walks through the tree of a grid without decoding its values. `None` for grids of points.
+pub(crate) fn walk_tree<S: Source>(file: &File<S>, info: &GridInfo) -> Result<Option<Walked>> {
+    let shape = info.shape().ok_or_else(|| no_way_past(info))?;
+    let mut reader = Reader::new(&file.source, info.tree_range[0], info.tree_range[1])?;
+    let mut budget = Budget::new(&file.limits);
+    let format = BlockFormat {
+        compression: info.compression,
+        half: info.save_float_as_half,
+        file_version: file.file_version,
+    };
+    for_value_type!(
+        info.stored_type(),
+        V => {
+            let tree = read::topology::<V>(&mut reader, format, shape, &mut budget)?;
+            if format.file_version < header::INSTANCES_SINCE {
+                Transform::read(&mut reader, format.file_version)?;
+            }
+            let contrary_mask = read::first_contrary_mask(&mut reader, format, &tree.leaves)?;
+            Ok(Some(Walked { end: reader.offset(), contrary_mask }))
+        },
+        Ok(None)
+    )
+}
+
 /// Reads the transform of a grid from behind its topology, where old files have it.
 fn transform_behind_topology(
     source: &dyn Source,

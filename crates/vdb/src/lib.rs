@@ -58,6 +58,7 @@ mod any;
 mod block;
 mod build;
 mod codec;
+pub mod diff;
 mod error;
 mod file;
 mod header;
@@ -71,6 +72,7 @@ mod source;
 mod stats;
 mod transform;
 mod tree;
+pub mod validate;
 mod value;
 mod write;
 

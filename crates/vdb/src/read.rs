@@ -135,6 +135,28 @@ pub(crate) fn skip_leaf_values<V: Value>(
     (0..leaves.len()).try_for_each(|i| skip_leaf(reader, format, leaves, i).map(|_| ()))
 }
 
+/// Moves past the values of all leaves. Gives position and origin of the first leaf whose mask does not stand before
+/// its values as it stands in the topology.
+pub(crate) fn first_contrary_mask<V: Value>(
+    reader: &mut Reader<'_>,
+    format: BlockFormat,
+    leaves: &Leaves<V>,
+) -> Result<Option<(u64, [i32; 3])>> {
+    let mut found = None;
+    let mut words = Vec::new();
+    for (i, origin) in leaves.origins.iter().enumerate() {
+        let at = reader.offset();
+        words.clear();
+        reader.mask_words(leaves.leaf_voxels, &mut words, "a leaf's mask")?;
+        if found.is_none() && words != leaves.mask(i) {
+            found = Some((at, *origin));
+        }
+        reader.seek(at);
+        skip_leaf(reader, format, leaves, i)?;
+    }
+    Ok(found)
+}
+
 /// The state of reading a topology.
 struct Walk<'r, 'a, V: Value> {
     reader: &'r mut Reader<'a>,

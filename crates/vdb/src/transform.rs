@@ -70,6 +70,22 @@ impl Transform {
         }
     }
 
+    /// The index coordinate of a world position. `None` if the map has no inverse, or is not finite there.
+    pub fn index_from_world(&self, world: [f64; 3]) -> Option<[f64; 3]> {
+        let found = match &self.map {
+            Map::Linear(matrix) => unapply(matrix, world),
+            Map::Frustum { index_box: [min, max], taper, depth, linear } => {
+                let size = [max[0] - min[0], max[1] - min[1], max[2] - min[2]];
+                let [x, y, z] = unapply(linear, world);
+                let widening = (1.0 / taper - 1.0) / depth;
+                let scale = (widening * z + 1.0) / size[0];
+                let middle = [0.5 * (min[0] + max[0]), 0.5 * (min[1] + max[1])];
+                [x / scale + middle[0], y / scale + middle[1], z * size[2] / depth + min[2]]
+            }
+        };
+        found.iter().all(|x| x.is_finite()).then_some(found)
+    }
+
     /// The size of a voxel in world units, per axis: the lengths of the images of the unit vectors, for a
     /// frustum at the middle of its near face.
     pub fn voxel_size(&self) -> [f64; 3] {
@@ -142,6 +158,18 @@ fn apply(m: &Matrix4, [x, y, z]: [f64; 3]) -> [f64; 3] {
     std::array::from_fn(|i| x * m[0][i] + y * m[1][i] + z * m[2][i] + m[3][i])
 }
 
+/// What [`apply`] sends to a position, by Cramer's rule; not finite if there is no such thing.
+fn unapply(m: &Matrix4, p: [f64; 3]) -> [f64; 3] {
+    let cross = |a: [f64; 3], b: [f64; 3]| {
+        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    };
+    let dot = |a: [f64; 3], b: [f64; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+    let [x, y, z] = [m[0], m[1], m[2]].map(|row| [row[0], row[1], row[2]]);
+    let offset = std::array::from_fn(|i| p[i] - m[3][i]);
+    let volume = dot(x, cross(y, z));
+    [cross(y, z), cross(z, x), cross(x, y)].map(|across| dot(offset, across) / volume)
+}
+
 fn read_linear(type_name: &str, reader: &mut Reader<'_>) -> Result<Matrix4> {
     // Besides the scale, OpenVDB writes four vectors that follow from it: voxel size, inverse, squared and
     // halved inverse.
@@ -165,5 +193,28 @@ fn read_linear(type_name: &str, reader: &mut Reader<'_>) -> Result<Matrix4> {
             Ok(matrix)
         }
         _ => Err(Error::unsupported(format!("the transform type '{type_name}'"))),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn index_from_world_undoes_world_from_index() {
+        let linear =
+            [[0.5, 0.1, 0.0, 0.0], [-0.2, 2.0, 0.3, 0.0], [0.0, 0.1, -1.5, 0.0], [3.0, -4.0, 5.0, 1.0]];
+        let index_box = [[-10.0, -20.0, 5.0], [30.0, 40.0, 60.0]];
+        let frustum = Map::Frustum { index_box, taper: 0.4, depth: 1.7, linear };
+        for map in [Map::Linear(linear), frustum] {
+            let transform = Transform { type_name: String::new(), map };
+            for index in [[0.0; 3], [1.0, 2.0, 30.0], [-7.5, 12.25, 44.0]] {
+                let back = transform.index_from_world(transform.world_from_index(index)).unwrap();
+                assert!((0..3).all(|i| (back[i] - index[i]).abs() < 1e-9), "{index:?} {back:?}");
+            }
+        }
+        let mut flat = linear;
+        flat[1] = [0.0; 4];
+        assert_eq!(Transform::affine(flat).index_from_world([1.0; 3]), None);
     }
 }

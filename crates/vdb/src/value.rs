@@ -43,6 +43,11 @@ pub trait Value: Copy + PartialEq + Debug + Default + Send + Sync + sealed::Seal
     /// The number of this component as a double; 0 past the last one.
     fn component(self, i: usize) -> f64;
 
+    /// How far the number of this component is from another value's. NaN if one of the two is NaN.
+    fn distance(self, other: Self, i: usize) -> f64 {
+        (self.component(i) - other.component(i)).abs()
+    }
+
     /// Whether both are the same to the bit, so that NaN is the same as itself and 0 differs from −0.
     fn same_bits(self, other: Self) -> bool;
 
@@ -207,6 +212,11 @@ number!(i32, "int32", 4, i32::wrapping_neg, f64::from, |x: i32| x, {
 });
 number!(i64, "int64", 8, i64::wrapping_neg, |x: i64| x as f64, |x: i64| x, {
     one_by_one!();
+
+    // Numbers beyond 2⁵³ that differ may be the same double.
+    fn distance(self, other: Self, _i: usize) -> f64 {
+        self.abs_diff(other) as f64
+    }
 });
 
 /// Vectors, component by component.
