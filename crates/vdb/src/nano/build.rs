@@ -309,11 +309,10 @@ fn inverse(m: &Matrix4) -> Option<Matrix4> {
         m[r0][c0] * m[r1][c1] - m[r0][c1] * m[r1][c0]
     };
     let determinant: f64 = (0..3).map(|column| m[0][column] * minor(0, column)).sum();
-    let mut inverse = [[0.0; 4]; 4];
-    for row in 0..3 {
-        for column in 0..3 {
-            inverse[row][column] = minor(column, row) / determinant;
-        }
-    }
+    let entry = |row: usize, column: usize| match row.max(column) {
+        0..3 => minor(column, row) / determinant,
+        _ => 0.0,
+    };
+    let inverse: Matrix4 = std::array::from_fn(|row| std::array::from_fn(|column| entry(row, column)));
     inverse.as_flattened().iter().all(|x| x.is_finite()).then_some(inverse)
 }
