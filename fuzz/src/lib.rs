@@ -30,7 +30,16 @@ pub fn use_tree(tree: &AnyTree) {
     with_tree!(tree, tree => assert_eq!(tree.leaf_order().len(), tree.leaves.len()));
 }
 
-/// A file of ours in the encodings of NanoVDB; none where its grids have no such form.
-pub fn as_nanovdb(_bytes: &[u8]) -> Vec<Vec<u8>> {
-    Vec::new()
+/// A file's grids as NanoVDB files; none where they have no such form.
+pub fn as_nanovdb(bytes: &[u8]) -> Vec<Vec<u8>> {
+    use nuage_vdb::nano::{Codec, Encoding, WriteOptions};
+    let grids = read_all(bytes);
+    let forms =
+        [(Encoding::Full, Codec::None), (Encoding::Fp8, Codec::Zip), (Encoding::Fp4, Codec::None), (Encoding::FpN { max_error: 0.01 }, Codec::None)];
+    let write = |(encoding, codec): &(Encoding, Codec)| {
+        let options = WriteOptions { encoding: *encoding, codec: *codec };
+        let mut out = Vec::new();
+        nuage_vdb::nano::write(&grids, &options, &mut out).ok().map(|()| out)
+    };
+    forms.iter().filter_map(write).collect()
 }
