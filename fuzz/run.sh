@@ -20,7 +20,7 @@ if ! command -v "$fuzz" >/dev/null; then
 fi
 
 host=$(rustc -vV | sed -n 's/^host: //p')
-cargo run --quiet --release --bin seeds -- corpus
+cargo run --quiet --release --example seeds -- corpus
 for target in "${targets[@]}"; do
     echo "== $target"
     # Without a sanitizer, so that a stable compiler will do: the crate holds no unsafe code.
