@@ -223,6 +223,13 @@ fn files_say_what_their_grids_are() {
 
     // The same grids without a file around them, as later versions write them.
     let bare: Vec<u8> = grids.iter().enumerate().flat_map(|(i, grid)| bare_grid(grid, i as u32, 2)).collect();
+    let second = bare_grid(&grids[0], 0, 2).len();
+    for offset in [-5000, i64::MIN, i64::MAX, 1 << 20] {
+        let mut wrong = bare.clone();
+        wrong[second + 672 + 24..second + 672 + 32].copy_from_slice(&offset.to_le_bytes());
+        let opened = nano::File::open(wrong);
+        assert!(matches!(opened.err(), Some(Error::Malformed { .. })), "{offset}");
+    }
     let file = nano::File::open(bare).unwrap();
     assert_eq!(file.grids.iter().map(|info| &info.name[..]).collect::<Vec<_>>(), ["b", &long]);
     assert_eq!(file.grids[0].active_bbox, Some([[9, 0, -5]; 2]));

@@ -284,9 +284,8 @@ fn bare_grids(reader: &mut Reader<'_>, grids: &mut Vec<GridInfo>, budget: &mut B
         }
         reader.seek(at(layout::TREE_VOXEL_COUNT));
         let active_voxels = reader.u64("the number of active voxels")?;
-        let inside =
-            |offset: i64, from: u64| from.checked_add_signed(offset).filter(|at| *at - begin < size_bytes);
-        let root = inside(root_at, at(layout::TREE)).filter(|root| *root >= begin);
+        let root = at(layout::TREE).checked_add_signed(root_at);
+        let root = root.filter(|root| root.checked_sub(begin).is_some_and(|root| root < size_bytes));
         reader.seek(root.ok_or_else(|| Error::malformed(begin, "the root stands outside of the grid"))?);
         let active_bbox = index_box(reader)?;
         if flags & layout::HAS_LONG_NAME != 0 {
