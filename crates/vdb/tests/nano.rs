@@ -1,5 +1,5 @@
-//! NanoVDB files: what we write we read again, and so do NanoVDB's own tools where they are installed; damaged files
-//! end in errors.
+//! NanoVDB files: what we write we read again, and so do NanoVDB's own tools where they are installed;
+//! damaged files end in errors.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -439,7 +439,8 @@ fn files_of_nanovdb_are_read_as_the_vdb_files_they_come_from() {
         (&["-f", "-b", "-c", "none", "-s", "none"], None),
         (&["-f", "--fpN", "-a", "0.01"], Some(16)),
     ];
-    // All files at once, since starting the converter takes longer than what it does. Within a file it goes by name.
+    // All files at once, since starting the converter takes longer than what it does. Within a file it goes
+    // by name.
     let files = names.map(|name| testkit::committed("data/edge").join(format!("{name}.vdb")));
     let wanted: Vec<Vec<Grid>> = files
         .iter()
