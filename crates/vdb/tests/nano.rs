@@ -1,5 +1,5 @@
-//! NanoVDB files: what we write we read again, and so do NanoVDB's own tools where they are installed; damaged files
-//! end in errors.
+//! NanoVDB files: what we write we read again, and so do NanoVDB's own tools where they are installed;
+//! damaged files end in errors.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -223,6 +223,13 @@ fn files_say_what_their_grids_are() {
 
     // The same grids without a file around them, as later versions write them.
     let bare: Vec<u8> = grids.iter().enumerate().flat_map(|(i, grid)| bare_grid(grid, i as u32, 2)).collect();
+    let second = bare_grid(&grids[0], 0, 2).len();
+    for offset in [-5000, i64::MIN, i64::MAX, 1 << 20] {
+        let mut wrong = bare.clone();
+        wrong[second + 672 + 24..second + 672 + 32].copy_from_slice(&offset.to_le_bytes());
+        let opened = nano::File::open(wrong);
+        assert!(matches!(opened.err(), Some(Error::Malformed { .. })), "{offset}");
+    }
     let file = nano::File::open(bare).unwrap();
     assert_eq!(file.grids.iter().map(|info| &info.name[..]).collect::<Vec<_>>(), ["b", &long]);
     assert_eq!(file.grids[0].active_bbox, Some([[9, 0, -5]; 2]));
@@ -432,7 +439,8 @@ fn files_of_nanovdb_are_read_as_the_vdb_files_they_come_from() {
         (&["-f", "-b", "-c", "none", "-s", "none"], None),
         (&["-f", "--fpN", "-a", "0.01"], Some(16)),
     ];
-    // All files at once, since starting the converter takes longer than what it does. Within a file it goes by name.
+    // All files at once, since starting the converter takes longer than what it does. Within a file it goes
+    // by name.
     let files = names.map(|name| testkit::committed("data/edge").join(format!("{name}.vdb")));
     let wanted: Vec<Vec<Grid>> = files
         .iter()

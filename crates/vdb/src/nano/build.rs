@@ -1,7 +1,7 @@
 //! From a tree to a grid's bytes: where each node goes, what the root, the tree and the grid say of them.
 //!
-//! Nodes stand breadth first: root, upper nodes, lower nodes, leaves, each level in OpenVDB's order. The bytes of
-//! single nodes are made in `encode`.
+//! Nodes stand breadth first: root, upper nodes, lower nodes, leaves, each level in OpenVDB's order. The
+//! bytes of single nodes are made in `encode`.
 
 use flate2::Crc;
 
@@ -283,8 +283,8 @@ fn affine(grid: &Grid) -> Result<&Matrix4> {
     })
 }
 
-/// The box of all active values in the world, voxels counted in full from their corner as NanoVDB does; of none the
-/// largest box turned inside out.
+/// The box of all active values in the world, voxels counted in full from their corner as NanoVDB does; of
+/// none the largest box turned inside out.
 fn world_box(grid: &Grid, bbox: Option<IndexBox>) -> [[f64; 3]; 2] {
     let [mut low, mut high] = [[f64::MAX; 3], [f64::MIN; 3]];
     let Some([min, max]) = bbox else { return [low, high] };

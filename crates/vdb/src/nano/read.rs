@@ -1,9 +1,10 @@
 //! From a grid's bytes to its tree.
 //!
-//! Nodes are found by offsets that nobody has checked. Each is followed from the level above and only ever downward,
-//! so that there are no cycles, and more nodes than the grid's bytes could hold are refused, so that a node that is
-//! named again and again does not grow without bound. Where a node stands in space follows from its parent; the boxes
-//! in the file, which NanoVDB leaves without an origin in nodes without active values, are not used.
+//! Nodes are found by offsets that nobody has checked. Each is followed from the level above and only ever
+//! downward, so that there are no cycles, and more nodes than the grid's bytes could hold are refused, so
+//! that a node that is named again and again does not grow without bound. Where a node stands in space
+//! follows from its parent; the boxes in the file, which NanoVDB leaves without an origin in nodes without
+//! active values, are not used.
 
 use super::layout::{self, Kind, Layout, NodeLayout};
 use super::quantize;
@@ -133,7 +134,8 @@ struct Walk<'a, 'b> {
     budget: &'b mut Budget,
 }
 
-/// Decodes the bytes of a leaf, whose values begin at `value_at` if they are plain, into what a tree stores of it.
+/// Decodes the bytes of a leaf, whose values begin at `value_at` if they are plain, into what a tree stores
+/// of it.
 type DecodeLeaf<V> = fn(leaf: &[u8], value_at: usize, stored: LeafValues<&mut [V], &mut [u64]>);
 
 impl Walk<'_, '_> {
