@@ -311,6 +311,7 @@ fn skip_tree(reader: &mut Reader<'_>, info: &GridInfo, format: BlockFormat, limi
         },
         match info.stored_type() {
             points::VALUE_TYPE => points::skip(reader, format, shape, &mut budget),
+            points::INDEX_VALUE_TYPE => points::skip_point_indices(reader, format, shape, &mut budget),
             _ => Err(no_way_past(info)),
         }
     )

@@ -22,7 +22,7 @@ impl Default for Limits {
 }
 
 /// Memory taken so far under a limit.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub(crate) struct Budget {
     limit_bytes: u64,
     taken_bytes: u64,

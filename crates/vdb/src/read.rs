@@ -300,7 +300,7 @@ fn locate_leaves<V: Value>(
 }
 
 /// Moves past what a file holds of a leaf and says where its values are.
-fn skip_leaf<V: Value>(
+pub(crate) fn skip_leaf<V: Value>(
     reader: &mut Reader<'_>,
     format: BlockFormat,
     leaves: &Leaves<V>,
