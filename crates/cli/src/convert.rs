@@ -11,7 +11,6 @@ use nuage_pipeline::output::write_whole;
 use nuage_vdb::{AnyFile, AnyTree, Compression, Grid, IndexBox, Metadata, WriteOptions, nano};
 
 use crate::error::{Failure, explain};
-use crate::grid::find_grid;
 use crate::source::{DiskFile, Memory};
 use crate::text::{number, one_line, thousands};
 
@@ -143,6 +142,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let mut metadata = Metadata::default();
     let mut input_bytes = 0;
     let mut names = Vec::new();
+    let mut missing: Vec<&String> = args.grid.iter().chain(args.rename.iter().map(|(old, _)| old)).collect();
     for path in inputs {
         let disk = DiskFile::open(path)?;
         let file = disk.any(args.memory)?;
@@ -152,14 +152,13 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
                 metadata.insert(name, value.clone());
             }
         }
+        missing = missing.iter().filter(|name| file.find(name).is_none()).copied().collect();
         names.extend(file.names().into_iter().map(str::to_owned));
         read(&disk, &file, args, &mut grids)?;
     }
-    if let Some((old, _)) = args.rename.iter().find(|(old, _)| !names.contains(old)) {
-        return Err(Failure::Usage(format!("grid '{old}' not found; there are: {}", names.join(", "))));
-    }
-    if let Some(name) = args.grid.iter().find(|name| !names.contains(name)) {
-        return Err(Failure::Usage(format!("grid '{name}' not found; there are: {}", names.join(", "))));
+    if let Some(name) = missing.first() {
+        let what = format!("grid '{name}' not found; there are: {}", names.join(", "));
+        return Err(Failure::file(inputs.first().unwrap_or(output), what));
     }
     let outputs = match args.split {
         false => vec![(output.clone(), grids)],
@@ -265,7 +264,7 @@ fn read(
     let names = file.names();
     let wanted: Vec<usize> = (0..names.len())
         .filter(|i| {
-            let is_meant = |name: &String| find_grid(file, Some(name)) == Ok(*i);
+            let is_meant = |name: &String| file.find(name) == Some(*i);
             args.grid.is_empty() || args.grid.iter().any(is_meant)
         })
         .collect();
@@ -281,7 +280,7 @@ fn read(
         }
     };
     for (i, mut grid) in wanted.into_iter().zip(read) {
-        if let Some((_, new)) = args.rename.iter().find(|(old, _)| old == names[i]) {
+        if let Some((_, new)) = args.rename.iter().find(|(old, _)| file.find(old) == Some(i)) {
             grid.name.clone_from(new);
         }
         let is_real = matches!(
