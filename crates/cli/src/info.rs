@@ -1,4 +1,4 @@
-//! `nuage info`: what is in VDB files, grid by grid.
+//! `nuage info`: what is in VDB and NanoVDB files, grid by grid.
 //!
 //! This module goes through files and grids and keeps going past what is damaged; [`text`] and [`json`] say
 //! how the findings look. Grids are read one after another, so memory holds one at a time.
@@ -6,11 +6,11 @@
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 
-use nuage_vdb::{AnyTree, File, Histogram, Source, Statistics};
+use nuage_vdb::{AnyFile, AnyTree, File, Histogram, Source, Statistics, nano};
 use serde_json::Value;
 
 use crate::error::{Failure, explain};
-use crate::source::DiskFile;
+use crate::source::{DiskFile, Memory};
 use crate::{json, text};
 
 /// List the grids of VDB files: type, size, values, transform, metadata.
@@ -36,6 +36,9 @@ pub(crate) struct Args {
     /// FNV-1a, 64 bits, over origin and active mask of every leaf and over the 512 values of every leaf.
     #[arg(long)]
     hash: bool,
+
+    #[command(flatten)]
+    memory: Memory,
 }
 
 /// How finely values are counted.
@@ -101,7 +104,10 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
 fn show_file(path: &Path, args: &Args, after_another: bool, out: &mut impl Write) -> Result<bool, Failure> {
     let opened = DiskFile::open(path);
     let disk = opened.or_else(|failure| failed(path, failure, args, out))?;
-    let file = disk.vdb().or_else(|failure| failed(path, failure, args, out))?;
+    let file = match disk.any(args.memory).or_else(|failure| failed(path, failure, args, out))? {
+        AnyFile::Vdb(file) => file,
+        AnyFile::Nano(file) => return show_nano(&disk, &file, args, after_another, out),
+    };
     if !args.json {
         if after_another {
             writeln!(out)?;
@@ -124,6 +130,46 @@ fn show_file(path: &Path, args: &Args, after_another: bool, out: &mut impl Write
     }
     if args.json {
         writeln!(out, "{}", json::file(path, disk.size(), &file, grids))?;
+    }
+    Ok(complete)
+}
+
+/// Prints a NanoVDB file. Whether all its grids that should be readable are.
+fn show_nano(
+    disk: &DiskFile,
+    file: &nano::File<&DiskFile>,
+    args: &Args,
+    after_another: bool,
+    out: &mut impl Write,
+) -> Result<bool, Failure> {
+    if !args.json {
+        if after_another {
+            writeln!(out)?;
+        }
+        text::nano_file(out, disk.path(), disk.size(), file)?;
+    }
+    let mut complete = true;
+    let mut grids: Vec<Value> = Vec::new();
+    for (index, info) in file.grids.iter().enumerate() {
+        let contents = match info.is_readable() {
+            false => Contents::NotDecoded,
+            true => match file.read_grid(index) {
+                Ok(grid) => Contents::Decoded(decoded(&grid.tree, args.hash)),
+                Err(error) => Contents::Damaged(explain(&error)),
+            },
+        };
+        match args.json {
+            true => grids.push(json::nano_grid(info, &contents, args.hash)),
+            false => text::nano_grid(out, info, &contents)?,
+        }
+        if let Contents::Damaged(error) = &contents {
+            complete = false;
+            out.flush()?;
+            Failure::file(disk.path(), format!("grid '{}': {error}", info.name)).report();
+        }
+    }
+    if args.json {
+        writeln!(out, "{}", json::nano_file(disk.path(), disk.size(), grids))?;
     }
     Ok(complete)
 }

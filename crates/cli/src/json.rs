@@ -7,8 +7,8 @@
 use std::path::Path;
 
 use nuage_vdb::{
-    ComponentStatistics, File, GridInfo, Histogram, MetaValue, Metadata, TileCount, Transform, Voxel,
-    format_g,
+    ComponentStatistics, File, GridInfo, Histogram, IndexBox, MetaValue, Metadata, TileCount, Transform,
+    Voxel, format_g, nano,
 };
 use serde_json::{Value, json};
 
@@ -45,14 +45,46 @@ pub(crate) fn failed_file(path: &Path, error: &str) -> Value {
 /// A grid. What its voxels would tell is null if they were not decoded; `error` says why if they should have
 /// been.
 pub(crate) fn grid(info: &GridInfo, contents: &Contents, with_hashes: bool) -> Value {
-    let mut grid = header(info);
+    let single_precision = matches!(info.value_type(), "float" | "vec3s");
+    with_contents(header(info), info.file_bbox(), single_precision, contents, with_hashes)
+}
+
+/// A NanoVDB file with its grids, as [`nano_grid`] describes them.
+pub(crate) fn nano_file(path: &Path, size_bytes: u64, grids: Vec<Value>) -> Value {
+    json!({ "file": base_name(path), "size": size_bytes, "format": "NanoVDB", "grids": grids })
+}
+
+/// A grid of a NanoVDB file, as [`grid`] describes others.
+pub(crate) fn nano_grid(info: &nano::GridInfo, contents: &Contents, with_hashes: bool) -> Value {
+    let [major, minor, patch] = info.version;
+    let header = json!({
+        "name": text(info.name.as_bytes()),
+        "value_type": info.value_type,
+        "grid_class": info.grid_class,
+        "version": format!("{major}.{minor}.{patch}"),
+        "compression": format!("{:?}", info.codec).to_lowercase(),
+        "size": info.size_bytes,
+        "voxel_size": numbers(&info.voxel_size),
+    });
+    let single_precision = !matches!(info.value_type, "double" | "Vec3d" | "int32" | "int64");
+    with_contents(header, info.active_bbox, single_precision, contents, with_hashes)
+}
+
+/// What is known of a grid's voxels, added to its header.
+fn with_contents(
+    header: Value,
+    stated_bbox: Option<IndexBox>,
+    single_precision: bool,
+    contents: &Contents,
+    with_hashes: bool,
+) -> Value {
+    let mut grid = header;
     let (decoded, error) = match contents {
         Contents::Decoded(decoded) => (Some(decoded), None),
         Contents::NotDecoded => (None, None),
         Contents::Damaged(error) => (None, Some(error)),
     };
     let stats = decoded.map(|decoded| &decoded.statistics);
-    let single_precision = matches!(info.value_type(), "float" | "vec3s");
     let per_component = |value: &dyn Fn(&ComponentStatistics) -> f64| {
         stats
             .filter(|s| s.min_max().is_some())
@@ -68,7 +100,7 @@ pub(crate) fn grid(info: &GridInfo, contents: &Contents, with_hashes: bool) -> V
     grid["tiles_by_depth"] = json!(stats.map(|s| tiles(&s.tiles_by_depth)));
     grid["node_counts_leaf_to_root"] = json!(stats.map(|s| s.node_counts_leaf_to_root.clone()));
     grid["leaf_count"] = json!(stats.map(|s| s.node_counts_leaf_to_root[0]));
-    grid["active_bbox"] = json!(stats.map_or_else(|| info.file_bbox(), |s| s.active_bbox));
+    grid["active_bbox"] = json!(stats.map_or(stated_bbox, |s| s.active_bbox));
     grid["leaf_bbox"] = json!(stats.and_then(|s| s.leaf_bbox));
     grid["min"] = per_component(&|c| c.min);
     grid["max"] = per_component(&|c| c.max);
@@ -142,13 +174,13 @@ fn histograms(all: &[Histogram]) -> Value {
 fn header(info: &GridInfo) -> Value {
     let creator = info.metadata.get("creator").filter(|value| value.type_name == "string");
     json!({
-        "name": characters(info.name.as_bytes()),
-        "unique_name": characters(info.unique_name.as_bytes()),
-        "grid_type": characters(info.grid_type.as_bytes()),
-        "value_type": characters(info.value_type().as_bytes()),
+        "name": text(info.name.as_bytes()),
+        "unique_name": text(info.unique_name.as_bytes()),
+        "grid_type": text(info.grid_type.as_bytes()),
+        "value_type": text(info.value_type().as_bytes()),
         "grid_class": info.grid_class(),
         "vector_type": info.metadata.vector_type(),
-        "creator": creator.map_or_else(String::new, |value| characters(&value.bytes)),
+        "creator": creator.map_or_else(String::new, |value| text(&value.bytes)),
         "save_float_as_half": info.save_float_as_half,
         "in_world_space": !info.metadata.bool("is_local_space").unwrap_or(false),
         "transform": transform(&info.transform),
@@ -159,7 +191,7 @@ fn header(info: &GridInfo) -> Value {
 fn transform(transform: &Transform) -> Value {
     let samples = SAMPLES.map(|index| [numbers(&index), numbers(&transform.world_from_index(index))]);
     let mut object = json!({
-        "type": characters(transform.type_name.as_bytes()),
+        "type": text(transform.type_name.as_bytes()),
         "linear": transform.matrix().is_some(),
         "voxel_size": numbers(&transform.voxel_size()),
     });
@@ -172,17 +204,18 @@ fn transform(transform: &Transform) -> Value {
 
 fn metadata(metadata: &Metadata) -> Value {
     let entry = |(name, value): (&str, &MetaValue)| {
-        let text = characters(&value.text_bytes());
-        (characters(name.as_bytes()), json!({ "type": characters(value.type_name.as_bytes()), "str": text }))
+        let spelled = text(&value.text_bytes());
+        (text(name.as_bytes()), json!({ "type": text(value.type_name.as_bytes()), "str": spelled }))
     };
     Value::Object(metadata.iter().map(entry).collect())
 }
 
 fn base_name(path: &Path) -> String {
-    characters(path.file_name().unwrap_or(path.as_os_str()).as_encoded_bytes())
+    text(path.file_name().unwrap_or(path.as_os_str()).as_encoded_bytes())
 }
 
-fn characters(bytes: &[u8]) -> String {
+/// The characters of the numbers of the bytes.
+pub(crate) fn text(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| char::from(*byte)).collect()
 }
 
@@ -191,7 +224,7 @@ fn numbers(values: &[f64]) -> Value {
 }
 
 /// A number that parses back to exactly `x`; whole ones without a decimal point.
-fn number(x: f64) -> Value {
+pub(crate) fn number(x: f64) -> Value {
     const EXACT_INTEGERS: f64 = (1u64 << 53) as f64;
     if x.is_nan() {
         json!("nan")
@@ -231,6 +264,6 @@ mod tests {
 
     #[test]
     fn bytes_become_the_characters_of_their_numbers() {
-        assert_eq!(characters(b"a\xc3\xa9\n"), "a\u{c3}\u{a9}\n");
+        assert_eq!(text(b"a\xc3\xa9\n"), "a\u{c3}\u{a9}\n");
     }
 }

@@ -4,7 +4,9 @@
 //! A subcommand takes its arguments and returns; it never ends the process itself. What it computes lives in
 //! the libraries, what it prints in modules of its own.
 
+mod convert;
 mod demo;
+mod diff;
 mod error;
 mod grid;
 mod info;
@@ -17,6 +19,7 @@ mod sample;
 mod shot;
 mod source;
 mod text;
+mod validate;
 mod values;
 
 use std::process::ExitCode;
@@ -42,6 +45,9 @@ enum Command {
     Probe(probe::Args),
     Render(Box<render::Args>),
     Demo(demo::Args),
+    Diff(diff::Args),
+    Validate(validate::Args),
+    Convert(convert::Args),
 }
 
 fn main() -> ExitCode {
@@ -50,6 +56,9 @@ fn main() -> ExitCode {
         Command::Probe(args) => probe::run(&args),
         Command::Render(args) => render::run(&args),
         Command::Demo(args) => demo::run(&args),
+        Command::Diff(args) => diff::run(&args),
+        Command::Validate(args) => validate::run(&args),
+        Command::Convert(args) => convert::run(&args),
     };
     match outcome {
         Ok(()) => ExitCode::SUCCESS,

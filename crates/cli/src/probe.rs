@@ -8,7 +8,7 @@ use nuage_vdb::{AnyTree, Value, Voxel, format_g, with_tree};
 use crate::error::Failure;
 use crate::grid::find_grid;
 use crate::json;
-use crate::source::DiskFile;
+use crate::source::{DiskFile, Memory};
 
 /// Print value, active state and depth at index coordinates of a grid.
 ///
@@ -32,6 +32,9 @@ pub(crate) struct Args {
     /// Print one JSON object per coordinate, one per line: ijk, v, on, depth
     #[arg(long)]
     json: bool,
+
+    #[command(flatten)]
+    memory: Memory,
 }
 
 /// Longer lines are no coordinates, and must not fill the memory.
@@ -50,7 +53,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         )));
     }
     let disk = DiskFile::open(&args.file)?;
-    let file = disk.vdb()?;
+    let file = disk.any(args.memory)?;
     let index = find_grid(&file, args.grid.as_deref()).map_err(|what| Failure::file(disk.path(), what))?;
     let tree = file.read_grid(index).map_err(|error| Failure::vdb(disk.path(), &error))?.tree;
     let mut out = BufWriter::new(io::stdout().lock());
@@ -73,7 +76,7 @@ fn print<V: Value>(out: &mut impl Write, ijk: [i32; 3], voxel: Voxel<V>, as_json
 }
 
 /// A value in enough digits to be exact; the numbers of a vector with commas between them.
-fn spelled<V: Value>(value: V) -> String {
+pub(crate) fn spelled<V: Value>(value: V) -> String {
     let digits = if matches!(V::NAME, "float" | "vec3s" | "half") { 9 } else { 17 };
     match V::NAME {
         "int64" => json::exact(value).to_string(),

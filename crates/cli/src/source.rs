@@ -8,9 +8,26 @@ use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
-use nuage_vdb::Source;
+use nuage_vdb::{AnyFile, Limits, Source};
 
 use crate::error::Failure;
+
+/// How much memory a file may ask for: shared by the subcommands that look into files.
+#[derive(Debug, Clone, Copy, clap::Args)]
+pub(crate) struct Memory {
+    /// The most memory that reading the headers of a file, or one grid, may take, in GiB
+    #[arg(long = "max-memory", value_name = "GIB", value_parser = limits, default_value = "16")]
+    pub(crate) limits: Limits,
+}
+
+/// A number of GiB as limits.
+fn limits(text: &str) -> Result<Limits, String> {
+    let gib: f64 = text.parse().map_err(|_| "this is no number".to_owned())?;
+    match gib > 0.0 && gib < f64::from(1 << 30) {
+        true => Ok(Limits { max_memory_bytes: (gib * f64::from(1 << 30)) as u64 }),
+        false => Err("give a number of GiB above 0, as in 2 or 0.5".into()),
+    }
+}
 
 /// An open file on disk.
 pub(crate) struct DiskFile {
@@ -45,6 +62,14 @@ impl DiskFile {
     /// If it is not a VDB file that we read.
     pub(crate) fn vdb(&self) -> Result<nuage_vdb::File<&Self>, Failure> {
         nuage_vdb::File::open(self).map_err(|error| Failure::vdb(&self.path, &error))
+    }
+
+    /// Reads the headers of the file as whatever it is, a VDB or a NanoVDB file.
+    ///
+    /// # Errors
+    /// If it is neither.
+    pub(crate) fn any(&self, memory: Memory) -> Result<AnyFile<&Self>, Failure> {
+        AnyFile::open_with(self, memory.limits).map_err(|error| Failure::vdb(&self.path, &error))
     }
 
     /// The path as it was given.

@@ -3,7 +3,7 @@
 use std::io::{self, Write};
 use std::path::Path;
 
-use nuage_vdb::{File, GridInfo, IndexBox, Map, Metadata, Statistics, Transform, format_g};
+use nuage_vdb::{File, GridInfo, IndexBox, Map, Metadata, Shape, Statistics, Transform, format_g, nano};
 
 use crate::info::{Contents, Decoded};
 
@@ -40,7 +40,11 @@ pub(crate) fn grid(out: &mut impl Write, info: &GridInfo, contents: &Contents) -
     }
     transform(out, &info.transform)?;
     match contents {
-        Contents::Decoded(decoded) => values(out, info, decoded)?,
+        Contents::Decoded(decoded) => {
+            values(out, info.shape(), decoded)?;
+            boxes(out, info, decoded.statistics.active_bbox, "")?;
+            storage(out, decoded)?;
+        }
         Contents::NotDecoded => {
             row(
                 out,
@@ -57,7 +61,7 @@ pub(crate) fn grid(out: &mut impl Write, info: &GridInfo, contents: &Contents) -
     metadata(out, &info.metadata)
 }
 
-fn values(out: &mut impl Write, info: &GridInfo, decoded: &Decoded) -> io::Result<()> {
+fn values(out: &mut impl Write, shape: Option<Shape>, decoded: &Decoded) -> io::Result<()> {
     let stats = &decoded.statistics;
     row(out, "background", vector_or_number(&decoded.background))?;
     match stats.min_max() {
@@ -85,9 +89,11 @@ fn values(out: &mut impl Write, info: &GridInfo, decoded: &Decoded) -> io::Resul
     }
     row(out, "active voxels", thousands(stats.active_voxels))?;
     row(out, "active tiles", tiles(stats))?;
-    row(out, "nodes", nodes(info, stats))?;
-    boxes(out, info, stats.active_bbox, "")?;
-    if let Some(bbox) = stats.leaf_bbox {
+    row(out, "nodes", nodes(shape, stats))
+}
+
+fn storage(out: &mut impl Write, decoded: &Decoded) -> io::Result<()> {
+    if let Some(bbox) = decoded.statistics.leaf_bbox {
         row(out, "leaf box", index_box(bbox))?;
     }
     row(out, "memory", format!("{} when read", size(decoded.memory_bytes)))?;
@@ -96,6 +102,46 @@ fn values(out: &mut impl Write, info: &GridInfo, decoded: &Decoded) -> io::Resul
         row(out, "value hash", format!("{:016x}", hashes.leaf_values))?;
     }
     Ok(())
+}
+
+/// Prints what there is to say of a NanoVDB file itself.
+pub(crate) fn nano_file<S>(
+    out: &mut impl Write,
+    path: &Path,
+    size_bytes: u64,
+    file: &nano::File<S>,
+) -> io::Result<()> {
+    let count = match file.grids.len() {
+        1 => "1 grid".to_owned(),
+        n => format!("{n} grids"),
+    };
+    writeln!(out, "{}: {count}", one_line(&path.display().to_string()))?;
+    row(out, "size", size(size_bytes))?;
+    row(out, "format", "NanoVDB")
+}
+
+/// Prints a grid of a NanoVDB file.
+pub(crate) fn nano_grid(out: &mut impl Write, info: &nano::GridInfo, contents: &Contents) -> io::Result<()> {
+    writeln!(out, "\n{}", one_line(&info.name))?;
+    row(out, "class", info.grid_class)?;
+    let [major, minor, patch] = info.version;
+    row(out, "type", format!("{} (NanoVDB {major}.{minor}.{patch})", info.value_type))?;
+    row(out, "compression", format!("{:?}", info.codec).to_lowercase())?;
+    row(out, "grid", size(info.size_bytes))?;
+    row(out, "voxel size", vector(&info.voxel_size))?;
+    match contents {
+        Contents::Decoded(decoded) => values(out, Some(Shape::STANDARD), decoded)?,
+        Contents::NotDecoded => {
+            row(out, "values", format!("not shown: values of type {} are not read", info.value_type))?;
+            row(out, "active voxels", thousands(info.active_voxels))?;
+        }
+        Contents::Damaged(error) => row(out, "values", format!("cannot be read: {}", one_line(error)))?,
+    }
+    row(out, "active box", info.active_bbox.map_or_else(|| "none".to_owned(), index_box))?;
+    match contents {
+        Contents::Decoded(decoded) => storage(out, decoded),
+        _ => Ok(()),
+    }
 }
 
 /// A number, or a vector in brackets.
@@ -138,8 +184,8 @@ fn tiles(stats: &Statistics) -> String {
 }
 
 /// How many nodes there are of each width.
-fn nodes(info: &GridInfo, stats: &Statistics) -> String {
-    let widths = info.shape().map(|shape| shape.log2_root_to_leaf().to_vec()).unwrap_or_default();
+fn nodes(shape: Option<Shape>, stats: &Statistics) -> String {
+    let widths = shape.map(|shape| shape.log2_root_to_leaf().to_vec()).unwrap_or_default();
     let mut counts = stats.node_counts_leaf_to_root.iter().rev();
     let root = counts.next().copied().unwrap_or_default();
     let mut texts = vec![format!("root {}", thousands(root))];
@@ -228,7 +274,7 @@ fn index_box(bbox: IndexBox) -> String {
     format!("{min:?} to {max:?}, {x} × {y} × {z} voxels")
 }
 
-fn number(x: f64) -> String {
+pub(crate) fn number(x: f64) -> String {
     format_g(x, 6)
 }
 
@@ -238,7 +284,7 @@ fn vector(values: &[f64]) -> String {
 }
 
 /// `1234567` as `1,234,567`.
-fn thousands(n: u64) -> String {
+pub(crate) fn thousands(n: u64) -> String {
     let digits = n.to_string();
     let groups: Vec<&str> =
         digits.as_bytes().rchunks(3).rev().filter_map(|group| std::str::from_utf8(group).ok()).collect();
@@ -246,7 +292,7 @@ fn thousands(n: u64) -> String {
 }
 
 /// `694 KiB (710,376 bytes)`.
-fn size(bytes: u64) -> String {
+pub(crate) fn size(bytes: u64) -> String {
     let exact = format!("{} bytes", thousands(bytes));
     let unit = [("KiB", 1), ("MiB", 2), ("GiB", 3), ("TiB", 4)]
         .into_iter()

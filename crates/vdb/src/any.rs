@@ -7,6 +7,7 @@ use std::sync::Arc;
 
 use half::f16;
 
+use crate::error::{Error, Result};
 use crate::metadata::Metadata;
 use crate::points::PointTree;
 use crate::stats::{Histogram, IndexBox, Statistics};
@@ -164,6 +165,26 @@ impl AnyTree {
             AnyTree::Points(points) => points.memory_bytes(),
             other => with_tree!(other, tree => tree.memory_bytes()),
         }
+    }
+
+    /// As [`Tree::clip`].
+    ///
+    /// # Errors
+    /// As [`Tree::clip`], and [`Error::Unsupported`] for points.
+    pub fn clip(&self, bbox: IndexBox, max_memory_bytes: u64) -> Result<AnyTree> {
+        Ok(match self {
+            AnyTree::Float(tree) => tree.clip(bbox, max_memory_bytes)?.into(),
+            AnyTree::Double(tree) => tree.clip(bbox, max_memory_bytes)?.into(),
+            AnyTree::Half(tree) => tree.clip(bbox, max_memory_bytes)?.into(),
+            AnyTree::Int32(tree) => tree.clip(bbox, max_memory_bytes)?.into(),
+            AnyTree::Int64(tree) => tree.clip(bbox, max_memory_bytes)?.into(),
+            AnyTree::Bool(tree) => tree.clip(bbox, max_memory_bytes)?.into(),
+            AnyTree::Mask(tree) => tree.clip(bbox, max_memory_bytes)?.into(),
+            AnyTree::Vec3s(tree) => tree.clip(bbox, max_memory_bytes)?.into(),
+            AnyTree::Vec3d(tree) => tree.clip(bbox, max_memory_bytes)?.into(),
+            AnyTree::Vec3i(tree) => tree.clip(bbox, max_memory_bytes)?.into(),
+            AnyTree::Points(_) => return Err(Error::unsupported("cutting grids of points in memory")),
+        })
     }
 
     /// As [`Tree::topology_hash`].

@@ -55,6 +55,7 @@
 #![forbid(unsafe_code)]
 
 mod any;
+mod any_file;
 mod block;
 mod build;
 mod codec;
@@ -77,6 +78,7 @@ mod value;
 mod write;
 
 pub use any::{AnyTree, AnyVoxel, Grid};
+pub use any_file::AnyFile;
 pub use block::Compression;
 pub use build::TreeBuilder;
 pub use error::{Error, Result};

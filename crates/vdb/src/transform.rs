@@ -8,6 +8,7 @@ mod legacy;
 
 use crate::error::{Error, Result};
 use crate::source::Reader;
+use crate::stats::IndexBox;
 
 /// From this version on the box of a frustum is in floating point.
 const FLOAT_BOX_SINCE: u32 = 221;
@@ -84,6 +85,21 @@ impl Transform {
             }
         };
         found.iter().all(|x| x.is_finite()).then_some(found)
+    }
+
+    /// The index box that holds all voxels whose centres lie in a box of world space, given by any two opposite
+    /// corners. `None` if there is no such voxel, or the map has no inverse.
+    pub fn index_box_from_world(&self, corners: [[f64; 3]; 2]) -> Option<IndexBox> {
+        let [mut min, mut max] = [[f64::INFINITY; 3], [f64::NEG_INFINITY; 3]];
+        for corner in 0..8_usize {
+            let world = std::array::from_fn(|axis| corners[corner >> axis & 1][axis]);
+            let index = self.index_from_world(world)?;
+            min = std::array::from_fn(|axis| min[axis].min(index[axis]));
+            max = std::array::from_fn(|axis| max[axis].max(index[axis]));
+        }
+        // What stands on the border is inside, in spite of rounding.
+        let bbox = [min.map(|x| (x - 1e-6).ceil() as i32), max.map(|x| (x + 1e-6).floor() as i32)];
+        (0..3).all(|axis| bbox[0][axis] <= bbox[1][axis]).then_some(bbox)
     }
 
     /// The size of a voxel in world units, per axis: the lengths of the images of the unit vectors, for a
@@ -199,6 +215,14 @@ fn read_linear(type_name: &str, reader: &mut Reader<'_>) -> Result<Matrix4> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_world_box_holds_the_voxels_whose_centres_it_holds() {
+        let transform = Transform::uniform_scale(0.1);
+        let corners = [[0.1, 0.45, -1.0], [0.3, -0.45, -0.71]];
+        assert_eq!(transform.index_box_from_world(corners), Some([[1, -4, -10], [3, 4, -8]]));
+        assert_eq!(transform.index_box_from_world([[0.11; 3], [0.19; 3]]), None);
+    }
 
     #[test]
     fn index_from_world_undoes_world_from_index() {

@@ -7,11 +7,13 @@
 use std::fmt;
 
 use crate::any::{AnyTree, Grid};
+use crate::any_file::is_nano;
 use crate::error::{Error, Result};
 use crate::file::{self, File};
 use crate::header::{self, GridInfo};
 use crate::limits::{Budget, Limits};
 use crate::metadata::Metadata;
+use crate::nano;
 use crate::source::{Reader, Source};
 use crate::stats::{IndexBox, Statistics};
 use crate::transform::{Map, Transform};
@@ -76,11 +78,14 @@ impl Report {
     }
 }
 
-/// Reads a file whole and says what is wrong with it.
+/// Reads a `.vdb` or `.nvdb` file whole and says what is wrong with it.
 ///
 /// # Errors
 /// If the bytes break the format, a limit is passed or the source fails. The message names the grid.
 pub fn validate<S: Source>(source: &S, limits: Limits) -> Result<Report> {
+    if is_nano(source)? {
+        return validate_nano(&nano::File::open_with(source, limits)?);
+    }
     let file = File::open_with(source, limits)?;
     let mut report = Report { grids: file.grids.len(), ..Report::default() };
     report.findings = check_layout(source, &file, &limits)?;
@@ -120,6 +125,26 @@ pub fn validate<S: Source>(source: &S, limits: Limits) -> Result<Report> {
         }
         let grid = file.read_grid(index).map_err(named)?;
         report.add(&info.unique_name, &grid);
+    }
+    Ok(report)
+}
+
+fn validate_nano<S: Source>(file: &nano::File<S>) -> Result<Report> {
+    let mut report = Report { grids: file.grids.len(), ..Report::default() };
+    for (index, info) in file.grids.iter().enumerate() {
+        if !info.is_readable() {
+            report.findings.push(Finding {
+                severity: Severity::Warning,
+                grid: Some(info.name.clone()),
+                what: format!(
+                    "its voxels were not looked at: values of type '{}' are not read",
+                    info.value_type
+                ),
+            });
+            continue;
+        }
+        let grid = file.read_grid(index).map_err(|error| in_grid(error, &info.name))?;
+        report.add(&info.name, &grid);
     }
     Ok(report)
 }
