@@ -172,7 +172,7 @@ proptest! {
     #[test]
     fn grids_of_all_types_come_back(seed: u64) {
         let grids = random_grids(seed);
-        for codec in [Codec::None, Codec::Zip] {
+        for codec in [Codec::None, Codec::Zip, Codec::Blosc] {
             let bytes = written(&grids, Encoding::Full, codec);
             prop_assert_eq!(&bytes, &written(&grids, Encoding::Full, codec));
             let back = read_back(bytes);
@@ -530,7 +530,7 @@ fn nanovdb_takes_what_we_write_and_finds_the_same_in_it() {
     }
     grids[0].name = "long name ".repeat(30);
     for (i, encoding) in encodings.into_iter().enumerate() {
-        let codec = if i % 2 == 0 { Codec::None } else { Codec::Zip };
+        let codec = [Codec::None, Codec::Zip, Codec::Blosc][i % 3];
         let context = format!("{encoding:?}");
         let bytes = written(&grids, encoding, codec);
         std::fs::write(&nvdb, &bytes).unwrap();

@@ -9,48 +9,80 @@ use super::{EncodeScratch, lz4, shuffle};
 const FORMAT_VERSION: u8 = 2;
 const LZ4_STREAM_VERSION: u8 = 1;
 const FLAG_BYTE_SHUFFLE: u8 = 1;
+const FLAG_STORED: u8 = 1 << 1;
 const FLAG_NOT_SPLIT: u8 = 1 << 4;
 const CODEC_LZ4: u8 = 1 << 5;
 
-/// Appends `data`, whole elements of `typesize` bytes, as a Blosc chunk to `out`, if that is smaller; if not, `out`
-/// stays as it is and `false` comes back.
+/// Appends `data`, whole elements of `typesize` bytes, as a Blosc chunk of one block to `out`, if that is smaller; if
+/// not, `out` stays as it is and `false` comes back.
 pub(crate) fn compress(data: &[u8], typesize: usize, out: &mut Vec<u8>, scratch: &mut EncodeScratch) -> bool {
     let begin = out.len();
-    let done = append(data, typesize, out, scratch).is_some();
+    let done = append(data, typesize, data.len(), out, scratch).is_some();
     if !done {
         out.truncate(begin);
     }
     done
 }
 
-fn append(data: &[u8], typesize: usize, out: &mut Vec<u8>, scratch: &mut EncodeScratch) -> Option<()> {
+/// Appends `data`, whole elements of `typesize` bytes and less than 2 GiB, as a Blosc chunk to `out`: in blocks that a
+/// decoder holds in its caches, or as they are if that is not smaller.
+pub(crate) fn compress_or_store(data: &[u8], typesize: u8, out: &mut Vec<u8>, scratch: &mut EncodeScratch) {
+    const BLOCK_BYTES: usize = 256 << 10;
+    let begin = out.len();
+    let block_bytes = BLOCK_BYTES.min(data.len()) / usize::from(typesize) * usize::from(typesize);
+    if append(data, typesize.into(), block_bytes, out, scratch).is_none() {
+        out.truncate(begin);
+        out.extend_from_slice(&[FORMAT_VERSION, LZ4_STREAM_VERSION, FLAG_STORED | CODEC_LZ4, typesize]);
+        for size in [data.len(), data.len(), data.len() + HEADER_BYTES] {
+            out.extend_from_slice(&(size as u32).to_le_bytes());
+        }
+        out.extend_from_slice(data);
+    }
+}
+
+fn append(
+    data: &[u8],
+    typesize: usize,
+    block_bytes: usize,
+    out: &mut Vec<u8>,
+    scratch: &mut EncodeScratch,
+) -> Option<()> {
     let begin = out.len();
     let size = u32::try_from(data.len()).ok().filter(|size| i32::try_from(*size).is_ok())?;
     let type_byte =
         u8::try_from(typesize).ok().filter(|size| *size > 0 && data.len().is_multiple_of(typesize))?;
-    let split = typesize <= MAX_SPLIT_TYPESIZE && data.len() / typesize >= MIN_SPLIT_BYTES;
-    let flags = FLAG_BYTE_SHUFFLE | CODEC_LZ4 | if split { 0 } else { FLAG_NOT_SPLIT };
+    let may_split = typesize <= MAX_SPLIT_TYPESIZE && block_bytes / typesize >= MIN_SPLIT_BYTES;
+    let flags = FLAG_BYTE_SHUFFLE | CODEC_LZ4 | if may_split { 0 } else { FLAG_NOT_SPLIT };
     out.extend_from_slice(&[FORMAT_VERSION, LZ4_STREAM_VERSION, flags, type_byte]);
-    // The data and the only block are as large as each other; the chunk's own size is put in at the end.
-    for number in [size, size, 0, HEADER_BYTES as u32 + 4] {
+    // The chunk's own size is put in at the end, and so are the places of the blocks.
+    for number in [size, block_bytes as u32, 0] {
         out.extend_from_slice(&number.to_le_bytes());
     }
+    let blocks = data.chunks(block_bytes.max(1));
+    let starts_at = out.len();
+    // Of nothing there is a block too.
+    out.resize(starts_at + 4 * blocks.len().max(1), 0);
     let EncodeScratch { shuffled, lz4: table, .. } = scratch;
-    shuffled.resize(data.len(), 0);
-    shuffle::shuffle_bytes(typesize, data, shuffled);
-    let streams = if split { typesize } else { 1 };
-    for stream in shuffled.chunks_exact((data.len() / streams).max(1)) {
-        let size_at = out.len();
-        out.extend_from_slice(&[0; 4]);
-        if !lz4::compress(stream, stream.len(), table, out) {
-            // As large as what it stands for: the stream itself.
-            out.truncate(size_at + 4);
-            out.extend_from_slice(stream);
-        }
-        let stream_bytes = (out.len() - size_at - 4) as u32;
-        out[size_at..size_at + 4].copy_from_slice(&stream_bytes.to_le_bytes());
-        if out.len() - begin >= data.len() {
-            return None;
+    for (i, block) in blocks.enumerate() {
+        let start = (out.len() - begin) as u32;
+        out[starts_at + 4 * i..][..4].copy_from_slice(&start.to_le_bytes());
+        shuffled.resize(block.len(), 0);
+        shuffle::shuffle_bytes(typesize, block, shuffled);
+        // A last block that is shorter than the others is never split.
+        let streams = if may_split && block.len() == block_bytes { typesize } else { 1 };
+        for stream in shuffled.chunks_exact((block.len() / streams).max(1)) {
+            let size_at = out.len();
+            out.extend_from_slice(&[0; 4]);
+            if !lz4::compress(stream, stream.len(), table, out) {
+                // As large as what it stands for: the stream itself.
+                out.truncate(size_at + 4);
+                out.extend_from_slice(stream);
+            }
+            let stream_bytes = (out.len() - size_at - 4) as u32;
+            out[size_at..size_at + 4].copy_from_slice(&stream_bytes.to_le_bytes());
+            if out.len() - begin >= data.len() {
+                return None;
+            }
         }
     }
     let chunk_bytes = (out.len() - begin) as u32;
@@ -88,6 +120,19 @@ mod tests {
                 prop_assert_eq!(out, b"before");
                 prop_assert!(noise || elements < 60, "{} × {}", typesize, elements);
             }
+        }
+
+        #[test]
+        fn chunks_of_many_blocks_decode_to_what_went_in(
+            elements in 60_000_usize..300_000, mask in prop_oneof![Just(0_u32), Just(0xff), Just(u32::MAX)],
+        ) {
+            let word = |i: usize| (i as u32).wrapping_mul(2_654_435_761).rotate_left(7) & mask | (i >> 4) as u32;
+            let data: Vec<u8> = (0..elements).flat_map(|i| word(i).to_le_bytes()).collect();
+            let (mut out, mut decoded) = (Vec::new(), vec![0; data.len()]);
+            compress_or_store(&data, 4, &mut out, &mut EncodeScratch::default());
+            prop_assert!(out.len() <= data.len() + HEADER_BYTES);
+            prop_assert_eq!(blosc::decompress(&out, &mut decoded, &mut Scratch::default()), Ok(()));
+            prop_assert!(decoded == data);
         }
     }
 }

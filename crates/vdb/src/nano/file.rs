@@ -30,6 +30,9 @@ pub enum Codec {
     Blosc,
 }
 
+/// The bytes of a grid that each Blosc chunk stands for; the last one's may be less.
+pub(super) const BLOSC_CHUNK_BYTES: usize = 1 << 30;
+
 impl Codec {
     pub(super) fn number(self) -> u16 {
         match self {
@@ -372,7 +375,6 @@ fn decompress<'a>(stored: &'a [u8], info: &GridInfo, budget: &mut Budget) -> Res
             }
         }
         Codec::Blosc => {
-            const CHUNK_BYTES: usize = 1 << 30;
             budget.take(size, 1, "the bytes of a grid")?;
             let mut scratch = Scratch::default();
             let (mut bytes, mut rest) = (Vec::new(), stored);
@@ -380,7 +382,7 @@ fn decompress<'a>(stored: &'a [u8], info: &GridInfo, budget: &mut Budget) -> Res
                 let (chunk, behind) =
                     sized_block(rest).ok_or_else(|| malformed("a Blosc chunk that is cut".into()))?;
                 let begin = bytes.len();
-                let len = (size - begin).min(CHUNK_BYTES);
+                let len = (size - begin).min(BLOSC_CHUNK_BYTES);
                 // The chunk says its size too. Nothing is allocated before both agree.
                 if chunk.get(4..8) != Some(&(len as u32).to_le_bytes()[..]) {
                     return Err(malformed(format!("a Blosc chunk that is not of {len} bytes")));

@@ -10,11 +10,12 @@ use flate2::write::ZlibEncoder;
 
 use super::build::{self, LeafEncoder, ROOT, VERSION};
 use super::encode;
-use super::file::Codec;
+use super::file::{BLOSC_CHUNK_BYTES, Codec};
 use super::layout::{self, Kind, Layout};
 use super::quantize::{self, Quantizer};
 use super::stats::NanoValue;
 use crate::any::{AnyTree, Grid};
+use crate::codec::{EncodeScratch, blosc_encoder};
 use crate::error::{Error, Result};
 use crate::tree::{Shape, Tree};
 
@@ -53,8 +54,8 @@ pub struct WriteOptions {
 /// NanoVDB allows it with that type of values. The same grids give the same bytes.
 ///
 /// # Errors
-/// [`Error::Unsupported`] for other types, trees of another shape than the standard one, transforms that are
-/// not affine, and [`Codec::Blosc`]. [`Error::Misuse`] if there are no grids, a name has a zero in it, a
+/// [`Error::Unsupported`] for other types, trees of another shape than the standard one, and transforms that
+/// are not affine. [`Error::Misuse`] if there are no grids, a name has a zero in it, a
 /// transform has no inverse, or a leaf cannot be quantised because its values are not all finite or too far
 /// apart. [`Error::Io`] if `out` fails.
 pub fn write(grids: &[Grid], options: &WriteOptions, out: &mut dyn Write) -> Result<()> {
@@ -152,7 +153,10 @@ fn write_segment(grid: &Grid, bytes: &[u8], codec: Codec, out: &mut dyn Write) -
             compressed = zip(bytes)?;
             &compressed
         }
-        Codec::Blosc => return Err(Error::unsupported("writing NanoVDB files with Blosc")),
+        Codec::Blosc => {
+            compressed = blosc(bytes);
+            &compressed
+        }
     };
     let mut head = Vec::with_capacity(layout::SEGMENT_BYTES + layout::META_BYTES + grid.name.len() + 1);
     head.extend_from_slice(&layout::MAGIC_OLD.to_le_bytes());
@@ -198,6 +202,20 @@ fn zip(bytes: &[u8]) -> Result<Vec<u8>> {
     let size = (stream.len() - 8) as u64;
     encode::put(&mut stream, 0, &size.to_le_bytes());
     Ok(stream)
+}
+
+/// Blosc chunks, each behind its size. NanoVDB expects them to stand for 1 GiB each but for the last.
+fn blosc(bytes: &[u8]) -> Vec<u8> {
+    let mut scratch = EncodeScratch::default();
+    let mut out = Vec::new();
+    for chunk in bytes.chunks(BLOSC_CHUNK_BYTES) {
+        let begin = out.len();
+        out.extend_from_slice(&[0; 8]);
+        blosc_encoder::compress_or_store(chunk, 4, &mut out, &mut scratch);
+        let size = (out.len() - begin - 8) as u64;
+        encode::put(&mut out, begin, &size.to_le_bytes());
+    }
+    out
 }
 
 /// The hash by which NanoVDB finds names: times 67 plus the next byte and the byte that falls out at the top.
