@@ -1,4 +1,4 @@
-//! Reads OpenVDB files in pure, safe Rust.
+//! Reads and writes OpenVDB files in pure, safe Rust.
 //!
 //! ```no_run
 //! let bytes = std::fs::read("smoke.vdb")?;
@@ -16,6 +16,9 @@
 //! 3 to 13), with ZIP, Blosc or no compression and with or without active masks; all metadata and transforms;
 //! shared trees; files written as streams. Other grid types are listed and refused with
 //! [`Error::Unsupported`] when asked for.
+//!
+//! What is written, by [`write()`]: grids of all these types but points, on trees of any shape, in the format of
+//! OpenVDB 6 to 12.
 //!
 //! What to expect of a bad file: an [`Error`] that says what is wrong and at which byte; never a panic, and
 //! never more memory than [`Limits`] allows.
