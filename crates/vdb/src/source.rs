@@ -130,7 +130,8 @@ impl<'a> Reader<'a> {
     ///
     /// The caller has checked that they lie before the end.
     pub(crate) fn load(&mut self, at: u64, len: usize) -> Result<()> {
-        let is_loaded = at >= self.window_at && at - self.window_at + len as u64 <= self.window.len() as u64;
+        let is_loaded = at >= self.window_at
+            && at - self.window_at + len as u64 <= self.window.len() as u64;
         if let (false, Some(source)) = (is_loaded, self.source) {
             let window = (len.max(WINDOW_BYTES) as u64).min(self.end.saturating_sub(at)).max(len as u64);
             self.window = source.range(at, window as usize)?;
@@ -221,8 +222,7 @@ mod tests {
 
     #[test]
     fn a_reader_gives_what_stands_in_the_source_whatever_the_order() {
-        let bytes: Vec<u8> =
-            (0..3 * WINDOW_BYTES as u32).map(|i| (i * 2_654_435_761_u32 >> 24) as u8).collect();
+        let bytes: Vec<u8> = (0..3 * WINDOW_BYTES as u32).map(|i| (i * 2_654_435_761_u32 >> 24) as u8).collect();
         let mut reader = Reader::new(&bytes, 5, bytes.len() as u64 - 7).unwrap();
         let mut at = 5;
         for len in [1, 1000, WINDOW_BYTES, 3, WINDOW_BYTES - 10, 0, 17] {
