@@ -2,9 +2,9 @@
 //! `cargo run --release -p nuage-vdb --example write_time -- FILE COMPRESSION WIDTH REPEATS [OUTPUT]`,
 //! COMPRESSION being `blosc`, `zip` or `none`, and WIDTH `full` or `half` for how floats are saved.
 //!
-//! Prints one line, `median_ms=... min_ms=... grids=... active_voxels=... bytes=...`. The bytes go to memory that is
-//! there already; reading is not timed. With OUTPUT, writes that file at the end. `bench/write_vs_openvdb.sh` sets it
-//! beside OpenVDB's own writer.
+//! Prints one line, `median_ms=... min_ms=... grids=... active_voxels=... bytes=...`. The bytes go to memory
+//! that is there already; reading is not timed. With OUTPUT, writes that file at the end.
+//! `bench/write_vs_openvdb.sh` sets it beside OpenVDB's own writer.
 
 #![allow(clippy::print_stdout, reason = "the line printed is what the program is for")]
 

@@ -40,6 +40,9 @@
 //! # Ok::<(), nuage_vdb::Error>(())
 //! ```
 //!
+//! What is written, by [`write()`]: grids of all these types but points, on trees of any shape, in the format of
+//! OpenVDB 6 to 12.
+//!
 //! What to expect of a bad file: an [`Error`] that says what is wrong and at which byte; never a panic, and
 //! never more memory than [`Limits`] allows.
 //!

@@ -36,7 +36,8 @@ fn random(seed: &mut u64, below: u64) -> u64 {
     (*seed >> 33) % below
 }
 
-/// Leaves of all kinds of blocks and tiles of all levels. `value` makes values of small numbers; 0 the background.
+/// Leaves of all kinds of blocks and tiles of all levels. `value` makes values of small numbers; 0 the
+/// background.
 fn tree<V: Value<Stored = V>>(seed: &mut u64, value: impl Fn(u64) -> V) -> Tree<V> {
     let mut builder = TreeBuilder::new(value(0), Shape::STANDARD);
     for i in 0..14_i32 {

@@ -1,4 +1,5 @@
-//! What is written is read back as it was: random trees of every type and shape, and every grid of the test data.
+//! What is written is read back as it was: random trees of every type and shape, and every grid of the test
+//! data.
 
 use std::sync::Arc;
 
@@ -182,7 +183,7 @@ proptest! {
         let floats = [0.75_f32, -0.75, 0.0, -0.0, nan, 1e-3_f32, 64.5, f32::INFINITY];
         let floats = floats.map(|x| if x.is_nan() { x } else { f16::from_f32(x).into() });
         let vectors: Vec<[f32; 3]> =
-            vec![[1.5, 0.0, -2.0], [-1.5, -0.0, 2.0], [0.0; 3], [nan, 0.0, 1.0], [0.0, 0.0, -0.0], [3.0, 4.0, 5.0]];
+            vec![[1.5, 0.0, -2.0], [-1.5, -0.0, 2.0], [0.0; 3], [nan, 0.0, 1.0], [0.0, 0.0, -0.0], [3.0; 3]];
         let mut checked = check(&recipe, &floats);
         checked |= check(&recipe, &floats.map(f64::from));
         checked |= check(&recipe, &floats.map(f16::from_f32));
@@ -340,9 +341,9 @@ fn trees_that_are_none_are_refused_before_a_byte_is_written() {
     let good = builder.build().unwrap();
     let breaks: [fn(&mut Tree<f32>); 12] = [
         |tree| drop(tree.levels.pop()),
-        |tree| drop(tree.leaves.masks.pop()),
-        |tree| drop(tree.leaves.values.pop()),
-        |tree| drop(tree.leaves.origins.pop()),
+        |tree| tree.leaves.masks.truncate(7),
+        |tree| tree.leaves.values.truncate(511),
+        |tree| tree.leaves.origins.truncate(2),
         |tree| tree.leaves.leaf_voxels = 64,
         |tree| tree.levels[1][0].first_child = usize::MAX,
         |tree| tree.levels[1][1].first_child = 0,

@@ -1,7 +1,8 @@
-//! The encoder of Blosc 1 chunks: one block, bytes shuffled, LZ4. The format is described in [`super::blosc`].
+//! The encoder of Blosc 1 chunks: one block, bytes shuffled, LZ4. The format is described in
+//! [`super::blosc`].
 //!
-//! Chunks differ from those of OpenVDB in one thing: their elements are the numbers that the values consist of, not
-//! always four bytes. Halves and doubles compress better that way, and every decoder reads it.
+//! Chunks differ from those of OpenVDB in one thing: their elements are the numbers that the values consist
+//! of, not always four bytes. Halves and doubles compress better that way, and every decoder reads it.
 
 use super::blosc::{HEADER_BYTES, MAX_SPLIT_TYPESIZE, MIN_SPLIT_BYTES};
 use super::{EncodeScratch, lz4, shuffle};
@@ -107,7 +108,11 @@ mod tests {
             seed in proptest::collection::vec(any::<u8>(), 1..700),
             noise in any::<bool>(),
         ) {
-            let byte = |i: usize| seed[i % seed.len()] & if noise || i.is_multiple_of(typesize) { 0xff } else { 0 };
+            // Without noise, all bytes of an element but the first are zero, which shrinks.
+            // An element of one byte has no others.
+            let noise = noise || typesize == 1;
+            let keep = |i: usize| if noise || i.is_multiple_of(typesize) { 0xff } else { 0 };
+            let byte = |i: usize| seed[i % seed.len()] & keep(i);
             let data: Vec<u8> = (0..elements * typesize).map(byte).collect();
             let mut scratch = EncodeScratch::default();
             let mut out = b"before".to_vec();

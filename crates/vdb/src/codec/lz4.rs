@@ -1,8 +1,8 @@
 //! An encoder of LZ4 blocks for streams of some hundred bytes.
 //!
-//! Blosc cuts the values of a leaf into streams of 512 bytes. Libraries clear a table of 8 KB or more before each;
-//! here the table is kept, and what earlier streams left in it is told apart by its number. Decoding stays with the
-//! library.
+//! Blosc cuts the values of a leaf into streams of 512 bytes. Libraries clear a table of 8 KB or more before
+//! each; here the table is kept, and what earlier streams left in it is told apart by its number. Decoding
+//! stays with the library.
 //!
 //! Format: <https://github.com/lz4/lz4/blob/dev/doc/lz4_Block_format.md>.
 
@@ -16,8 +16,8 @@ const TABLE_LOG2: u32 = 12;
 /// After as many misses as two to this, the search takes longer steps.
 const SKIP_LOG2: u32 = 6;
 
-/// Where each hash was seen last. Positions count on from stream to stream, so that those of earlier streams are
-/// below the first of the present one.
+/// Where each hash was seen last. Positions count on from stream to stream, so that those of earlier streams
+/// are below the first of the present one.
 pub(super) struct Table {
     seen: Box<[u32; 1 << TABLE_LOG2]>,
     next: u32,
@@ -29,8 +29,8 @@ impl Default for Table {
     }
 }
 
-/// Appends `src` as an LZ4 block to `out`, if that takes less than `limit` bytes. If not, what is appended is of no
-/// use, and `false` comes back.
+/// Appends `src` as an LZ4 block to `out`, if that takes less than `limit` bytes. If not, what is appended is
+/// of no use, and `false` comes back.
 pub(super) fn compress(src: &[u8], limit: usize, table: &mut Table, out: &mut Vec<u8>) -> bool {
     let Some(room) = limit.checked_sub(1) else { return false };
     let begin = out.len();

@@ -36,8 +36,8 @@ pub(crate) struct Scratch {
     zstd: Option<ruzstd::decoding::FrameDecoder>,
 }
 
-/// What encoders keep from block to block, for the same reason. What is left in it never changes what the next block
-/// is encoded to.
+/// What encoders keep from block to block, for the same reason. What is left in it never changes what the
+/// next block is encoded to.
 #[derive(Default)]
 pub(crate) struct EncodeScratch {
     /// A Blosc block after its shuffle.

@@ -1,5 +1,5 @@
-//! Blosc's two filters, which regroup a block before it is compressed: the byte shuffle both ways, the bit shuffle
-//! as it is undone.
+//! Blosc's two filters, which regroup a block before it is compressed: the byte shuffle both ways, the bit
+//! shuffle as it is undone.
 //!
 //! The byte shuffle stores byte 0 of all elements, then byte 1 of all elements, and so on. The bit shuffle
 //! does the same with bits: bit 0 of byte 0 of all elements, packed eight to a byte with the first element

@@ -1,6 +1,7 @@
 //! One zlib stream, inflated into a slice of known size, or deflated if that makes it smaller.
 //!
-//! Both are flate2's work; here are only the rules that a block must fill its slice exactly, and that it must shrink.
+//! Both are flate2's work; here are only the rules that a block must fill its slice exactly, and that it must
+//! shrink.
 
 use flate2::{Compress, Compression, Decompress, FlushCompress, FlushDecompress, Status};
 
@@ -26,7 +27,8 @@ pub(crate) fn decompress(data: &[u8], out: &mut [u8], scratch: &mut Scratch) -> 
     }
 }
 
-/// Appends `data` as a zlib stream to `out`, if that is smaller; if not, `out` stays as it is and `false` comes back.
+/// Appends `data` as a zlib stream to `out`, if that is smaller; if not, `out` stays as it is and `false`
+/// comes back.
 pub(crate) fn compress(data: &[u8], out: &mut Vec<u8>, scratch: &mut EncodeScratch) -> bool {
     let deflate = scratch.deflate.get_or_insert_with(|| Compress::new(Compression::new(LEVEL), true));
     deflate.reset();

@@ -1,7 +1,7 @@
 //! Value blocks as they are written: which of the seven kinds fits a node, and its payload.
 //!
-//! The grammar of blocks stands in [`crate::block`]. Values are compared by their bits, so that NaN and −0 come back
-//! as they were; OpenVDB compares them as numbers, but reads what is written here.
+//! The grammar of blocks stands in [`crate::block`]. Values are compared by their bits, so that NaN and −0
+//! come back as they were; OpenVDB compares them as numbers, but reads what is written here.
 
 use crate::block::{
     ALL_VALUES, BACKGROUND, BlockFormat, MASK_AND_ONE_INACTIVE_VALUE, MASK_AND_TWO_INACTIVE_VALUES,
@@ -50,8 +50,8 @@ impl<V: Value> BlockEncoder<V> {
         }
     }
 
-    /// Appends the block of a node: its values, one per slot, of which those in `children` say nothing. A mask that is
-    /// too short has no bits behind its end.
+    /// Appends the block of a node: its values, one per slot, of which those in `children` say nothing. A
+    /// mask that is too short has no bits behind its end.
     pub(super) fn append(&mut self, values: &[V], active: &[u64], children: &[u64], out: &mut Vec<u8>) {
         let all_values = || Inactive { kind: ALL_VALUES, stored: [None; 2], marks_first: false };
         let mut selection = Vec::new();

@@ -1,9 +1,9 @@
 //! Writing files: what stands where in a file, and which grids share a tree.
 //!
-//! Every position is known before the byte at it is written, so that the sink only has to take bytes in order: each
-//! grid is encoded in memory and freed before the next one. How nodes are encoded lives in [`tree`] and [`block`],
-//! what is added to the metadata in [`metadata`], transforms in [`transform`]. Files that appear whole or not at all
-//! are a matter of those who own file names.
+//! Every position is known before the byte at it is written, so that the sink only has to take bytes in
+//! order: each grid is encoded in memory and freed before the next one. How nodes are encoded lives in
+//! [`tree`] and [`block`], what is added to the metadata in [`metadata`], transforms in [`transform`]. Files
+//! that appear whole or not at all are a matter of those who own file names.
 
 mod block;
 mod metadata;
@@ -28,10 +28,12 @@ use tree::EncodedTree;
 const FILE_VERSION: u32 = 224;
 /// The first version that knows `half` as a type of values.
 const HALF_GRID_VERSION: u32 = 225;
-/// Readers look at the version of the library to drop positions for delayed loading that older ones copied from file
-/// to file, up to 6.1. This one stands for how the metadata are computed: the memory is what 10.0 would take.
+/// Readers look at the version of the library to drop positions for delayed loading that older ones copied
+/// from file to file, up to 6.1. This one stands for how the metadata are computed: the memory is what 10.0
+/// would take.
 const LIBRARY_VERSION: [u32; 2] = [10, 0];
-/// Behind its names and type, a grid has three positions: where its header, its values and what follows it begin.
+/// Behind its names and type, a grid has three positions: where its header, its values and what follows it
+/// begin.
 const POSITIONS_BYTES: u64 = 24;
 
 /// How a file is written.
@@ -48,16 +50,16 @@ impl Default for WriteOptions {
     }
 }
 
-/// Writes a whole file: its metadata, and the grids in their order. Grids that share a tree ([`Arc::ptr_eq`], and the
-/// same [`Grid::save_float_as_half`]) are written once, the others as instances.
+/// Writes a whole file: its metadata, and the grids in their order. Grids that share a tree ([`Arc::ptr_eq`],
+/// and the same [`Grid::save_float_as_half`]) are written once, the others as instances.
 ///
 /// What OpenVDB notes in the metadata of grids on writing is computed anew: `file_bbox_min`, `file_bbox_max`,
-/// `file_voxel_count`, `file_mem_bytes`, `file_compression`, and `name` and `is_saved_as_half_float`, which follow
-/// the fields of [`Grid`]. Equal input gives equal bytes, the file's UUID included.
+/// `file_voxel_count`, `file_mem_bytes`, `file_compression`, and `name` and `is_saved_as_half_float`, which
+/// follow the fields of [`Grid`]. Equal input gives equal bytes, the file's UUID included.
 ///
 /// # Errors
-/// [`Error::Io`] if the sink fails, [`Error::Unsupported`] for grids of points, and [`Error::Misuse`] if the vectors of
-/// a tree do not fit each other. Of the latter two nothing has been written yet.
+/// [`Error::Io`] if the sink fails, [`Error::Unsupported`] for grids of points, and [`Error::Misuse`] if the
+/// vectors of a tree do not fit each other. Of the latter two nothing has been written yet.
 pub fn write(grids: &[Grid], metadata: &Metadata, options: &WriteOptions, out: &mut dyn Write) -> Result<()> {
     let plans = plan(grids, options)?;
     let mut head = head(grids, &plans, metadata)?;
@@ -166,8 +168,8 @@ fn head(grids: &[Grid], plans: &[Plan], metadata: &Metadata) -> Result<Vec<u8>> 
     Ok(head)
 }
 
-/// An identifier that follows from everything that is written, so that it changes where the file does: a UUID of
-/// version 8 (RFC 9562).
+/// An identifier that follows from everything that is written, so that it changes where the file does: a UUID
+/// of version 8 (RFC 9562).
 fn uuid(grids: &[Grid], plans: &[Plan], tail: &[u8]) -> String {
     let mut hashes = [Fnv1a::default(), Fnv1a::default()];
     hashes[1].add(b"second half");

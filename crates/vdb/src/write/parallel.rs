@@ -1,4 +1,5 @@
-//! Work on numbered tasks whose results keep their order: in parallel with the feature `parallel`, else one by one.
+//! Work on numbered tasks whose results keep their order: in parallel with the feature `parallel`, else one
+//! by one.
 
 /// The results of `run` for all tasks. Each thread makes its own `scratch`.
 #[cfg(feature = "parallel")]

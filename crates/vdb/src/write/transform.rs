@@ -57,8 +57,8 @@ fn append_linear(type_name: &str, matrix: &Matrix4, bytes: &mut Vec<u8>) -> Resu
     Ok(())
 }
 
-/// Whether nothing but the diagonal and the translation differs from the identity. No scale may be zero, since maps of
-/// that kind hold its inverse.
+/// Whether nothing but the diagonal and the translation differs from the identity. No scale may be zero,
+/// since maps of that kind hold its inverse.
 fn is_scale_and_translation(matrix: &Matrix4) -> bool {
     let off_diagonal = |row: usize, column: usize| row < 3 && column < 3 && row != column;
     let zeros =

@@ -26,8 +26,8 @@ impl EncodedTree {
     }
 }
 
-/// Whether the vectors fit each other: their lengths, every node at its place, every node with one parent. If not,
-/// what is wrong.
+/// Whether the vectors fit each other: their lengths, every node at its place, every node with one parent. If
+/// not, what is wrong.
 pub(super) fn check<V: Value>(tree: &Tree<V>) -> Result<(), String> {
     let ensure = |holds: bool, what: &str| if holds { Ok(()) } else { Err(what.to_owned()) };
     let (shape, leaves) = (tree.shape, &tree.leaves);

@@ -2,8 +2,8 @@
 
     read_grids.py FILE PROBES TRUTH
 
-PROBES is a JSON list of index coordinates. TRUTH becomes a JSON list with an entry per grid, whose probes are values,
-active states and depths at those coordinates.
+PROBES is a JSON list of index coordinates. TRUTH becomes a JSON list with an entry per grid, whose probes are
+values, active states and depths at those coordinates.
 """
 
 import json
