@@ -74,7 +74,10 @@ install_packages() {
     ${as_root[@]+"${as_root[@]}"} "${apt[@]}" install -y --no-install-recommends "$@" >/dev/null
 }
 
-has_openvdb() { command -v vdb_print >/dev/null && /usr/bin/python3 -c 'import pyopenvdb' 2>/dev/null; }
+has_openvdb() {
+    command -v vdb_print >/dev/null && command -v nanovdb_validate >/dev/null &&
+        /usr/bin/python3 -c 'import pyopenvdb' 2>/dev/null
+}
 
 has_vulkan() {
     local drivers=(/usr/share/vulkan/icd.d/*.json /etc/vulkan/icd.d/*.json)
@@ -126,9 +129,9 @@ done
 
 [[ -d $NUAGE_DATA/data ]] || lacks data "no folder data in $NUAGE_DATA" "set NUAGE_DATA"
 
-has_openvdb || install_packages libopenvdb-tools python3-openvdb || true
-has_openvdb || lacks openvdb "no vdb_print or pyopenvdb to compare with" \
-    "install libopenvdb-tools and python3-openvdb"
+has_openvdb || install_packages libopenvdb-tools libnanovdb-tools python3-openvdb || true
+has_openvdb || lacks openvdb "no vdb_print, nanovdb_validate or pyopenvdb to compare with" \
+    "install libopenvdb-tools, libnanovdb-tools and python3-openvdb"
 
 if requires gpu && ! has_vulkan; then install_packages mesa-vulkan-drivers libvulkan1 || true; fi
 has_vulkan || lacks gpu "no Vulkan driver" "install mesa-vulkan-drivers and libvulkan1"

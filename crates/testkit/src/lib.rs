@@ -12,6 +12,7 @@ use std::path::{Path, PathBuf};
 use serde_json::Value;
 
 pub mod npy;
+pub mod synthetic;
 
 /// The root of the repository.
 pub fn workspace() -> PathBuf {

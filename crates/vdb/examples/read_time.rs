@@ -5,15 +5,31 @@
 
 #![allow(clippy::print_stdout, reason = "the line printed is what the program is for")]
 
+use std::borrow::Cow;
 use std::error::Error;
+use std::io;
+use std::os::unix::fs::FileExt;
 use std::time::Instant;
 
-use nuage_vdb::{File, Grid};
+use nuage_vdb::{File, Grid, Source};
+
+/// A file on disk, of which the reader asks for as much as it decodes at a time.
+struct Disk(std::fs::File);
+
+impl Source for Disk {
+    fn size_bytes(&self) -> io::Result<u64> {
+        Ok(self.0.metadata()?.len())
+    }
+
+    fn range(&self, offset: u64, len: usize) -> io::Result<Cow<'_, [u8]>> {
+        let mut bytes = vec![0; len];
+        self.0.read_exact_at(&mut bytes, offset)?;
+        Ok(Cow::Owned(bytes))
+    }
+}
 
 fn read_all_grids(path: &str) -> Result<Vec<Grid>, Box<dyn Error>> {
-    let file = File::open(std::fs::read(path)?)?;
-    let grids: nuage_vdb::Result<Vec<Grid>> = (0..file.grids.len()).map(|i| file.read_grid(i)).collect();
-    Ok(grids?)
+    Ok(File::open(Disk(std::fs::File::open(path)?))?.read_all()?)
 }
 
 fn median(sorted: &[f64]) -> Option<f64> {
@@ -34,8 +50,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         let grids = read_all_grids(path)?;
         times_ms.push(begin.elapsed().as_secs_f64() * 1e3);
         if times_ms.len() == 1 {
-            counts =
-                (grids.len(), grids.iter().map(|grid| grid.tree.statistics().active_voxels).sum::<u64>());
+            counts = (grids.len(), grids.iter().map(|grid| grid.tree.active_voxel_count()).sum::<u64>());
         }
     }
     times_ms.sort_by(f64::total_cmp);

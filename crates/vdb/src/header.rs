@@ -228,7 +228,8 @@ pub(crate) fn read_grid_header(
         name: metadata.string("name").unwrap_or(&descriptor.name).to_owned(),
         unique_name: descriptor.unique_name.clone(),
         grid_type: descriptor.grid_type.clone(),
-        save_float_as_half: descriptor.save_float_as_half,
+        // OpenVDB goes by the metadata; the mark on the type is for those who have not read them yet.
+        save_float_as_half: metadata.bool("is_saved_as_half_float").unwrap_or(descriptor.save_float_as_half),
         compression,
         metadata,
         transform,

@@ -62,7 +62,7 @@ impl<S: Source + ?Sized> Source for &S {
 const MAX_NAME_BYTES: usize = 1 << 20;
 
 /// How much is read at once where more is likely to be wanted.
-const WINDOW_BYTES: usize = 256 << 10;
+const WINDOW_BYTES: usize = 64 << 10;
 
 /// A checked reader of little-endian values from some part of a source.
 pub(crate) struct Reader<'a> {
@@ -222,7 +222,7 @@ mod tests {
     #[test]
     fn a_reader_gives_what_stands_in_the_source_whatever_the_order() {
         let bytes: Vec<u8> =
-            (0..3 * WINDOW_BYTES as u32).map(|i| (i * 2_654_435_761_u32 >> 24) as u8).collect();
+            (0..3 * WINDOW_BYTES as u32).map(|i| (i.wrapping_mul(2_654_435_761) >> 24) as u8).collect();
         let mut reader = Reader::new(&bytes, 5, bytes.len() as u64 - 7).unwrap();
         let mut at = 5;
         for len in [1, 1000, WINDOW_BYTES, 3, WINDOW_BYTES - 10, 0, 17] {

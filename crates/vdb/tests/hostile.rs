@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use cap::Cap;
 use nuage_testkit as testkit;
-use nuage_vdb::{Error, File, Limits, Tree};
+use nuage_vdb::{AnyTree, Error, File, Limits, with_tree};
 
 #[global_allocator]
 static ALLOCATOR: Cap<System> = Cap::new(System, usize::MAX);
@@ -41,27 +41,29 @@ fn committed(name: &str) -> Vec<u8> {
     std::fs::read(testkit::committed("data/edge").join(name)).unwrap()
 }
 
-/// Opens the file, reads every float grid and makes use of the trees.
+/// Opens the file, reads every grid and makes use of the trees.
 fn read_all(bytes: &[u8], limits: Limits) -> Result<usize, Error> {
     let file = File::open_with(bytes, limits)?;
     let mut read = 0;
     for index in (0..file.grids.len()).filter(|i| file.grids[*i].is_readable()) {
         let grid = file.read_grid(index)?;
         use_tree(&grid.tree);
-        grid.info.transform.voxel_size();
+        grid.transform.voxel_size();
         read += 1;
     }
     Ok(read)
 }
 
 /// Walks through a tree; whatever a damaged file made of it, nothing may point outside.
-fn use_tree(tree: &Tree) {
-    let stats = tree.statistics();
-    for corner in stats.active_bbox.into_iter().flatten() {
+fn use_tree(tree: &AnyTree) {
+    for corner in tree.statistics().active_bbox.into_iter().flatten() {
         tree.voxel(corner);
     }
-    let leaves = tree.leaf_order().inspect(|leaf| assert!(*leaf < tree.leaves.len())).count();
-    assert_eq!(leaves, tree.leaves.len());
+    with_tree!(tree, tree => {
+        let leaves = tree.leaf_order();
+        assert!(leaves.iter().all(|leaf| *leaf < tree.leaves.len()));
+        assert_eq!(leaves.len(), tree.leaves.len());
+    });
 }
 
 /// Like [`read_all`] for a file that was sound before: its errors are never the caller's or the disk's fault.

@@ -1,5 +1,5 @@
-//! NanoVDB files: what we write we read again, and so do NanoVDB's own tools where they are installed; damaged files
-//! end in errors.
+//! NanoVDB files: what we write we read again, and so do NanoVDB's own tools where they are installed;
+//! damaged files end in errors.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -34,7 +34,7 @@ fn random_tree<V: Value>(seed: u64, value: fn(u64) -> V) -> Tree<V> {
     let mut random = SplitMix(seed);
     let mut builder = TreeBuilder::new(value(random.next()), Shape::STANDARD);
     // Places that cannot overlap: depths have regions of their own.
-    for i in 0..random.below(6) as i32 {
+    for i in 0..1 + random.below(5) as i32 {
         let mask: Vec<u64> = match random.below(3) {
             0 => vec![0; 8],
             1 => vec![!0; 8],
@@ -167,7 +167,7 @@ fn half_quantum(tree: &AnyTree, bits: u32) -> impl Fn(usize) -> f64 {
 const QUANTISED: [(Encoding, u32); 3] = [(Encoding::Fp16, 16), (Encoding::Fp8, 8), (Encoding::Fp4, 4)];
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(12))]
+    #![proptest_config(ProptestConfig::with_cases(4))]
 
     #[test]
     fn grids_of_all_types_come_back(seed: u64) {
@@ -223,6 +223,13 @@ fn files_say_what_their_grids_are() {
 
     // The same grids without a file around them, as later versions write them.
     let bare: Vec<u8> = grids.iter().enumerate().flat_map(|(i, grid)| bare_grid(grid, i as u32, 2)).collect();
+    let second = bare_grid(&grids[0], 0, 2).len();
+    for offset in [-5000, i64::MIN, i64::MAX, 1 << 20] {
+        let mut wrong = bare.clone();
+        wrong[second + 672 + 24..second + 672 + 32].copy_from_slice(&offset.to_le_bytes());
+        let opened = nano::File::open(wrong);
+        assert!(matches!(opened.err(), Some(Error::Malformed { .. })), "{offset}");
+    }
     let file = nano::File::open(bare).unwrap();
     assert_eq!(file.grids.iter().map(|info| &info.name[..]).collect::<Vec<_>>(), ["b", &long]);
     assert_eq!(file.grids[0].active_bbox, Some([[9, 0, -5]; 2]));
@@ -301,7 +308,7 @@ fn damaged_files_end_in_errors_or_grids() {
         for len in (0..bytes.len()).filter(|len| *len < 2000 || len % 9973 == 0) {
             assert!(!read_all(&bytes[..len]), "cut after {len} of {}", bytes.len());
         }
-        for round in 0..300 {
+        for round in 0..200 {
             let mut bytes = bytes.clone();
             // Headers and root, else anywhere.
             let reach = if round % 3 < 2 { bytes.len().min(1100) } else { bytes.len() };
@@ -312,7 +319,7 @@ fn damaged_files_end_in_errors_or_grids() {
             read += usize::from(read_all(&bytes));
         }
     }
-    assert!((100..1450).contains(&read), "{read} of 1500 damaged files were read");
+    assert!((50..950).contains(&read), "{read} of 1000 damaged files were read");
 }
 
 /// One root tile after the other that names the same nodes must not grow into more than the file holds.
@@ -412,12 +419,8 @@ fn files_of_nanovdb_are_read_as_the_vdb_files_they_come_from() {
     let names = [
         "background_nonzero",
         "comp_random_none",
-        "comp_sphere_mask",
         "cross_zero",
-        "dense_constant_unpruned",
         "empty_grid_background",
-        "far_coords",
-        "half_mask",
         "leaf_masks",
         "lower_tiles_only",
         "py10_mixed",
@@ -427,54 +430,54 @@ fn files_of_nanovdb_are_read_as_the_vdb_files_they_come_from() {
         "special_values",
         "tiles_levels",
     ];
-    let encodings: [(&[&str], Option<u32>); 6] = [
+    let encodings: [(&[&str], Option<u32>); 7] = [
         (&["-f"], None),
         (&["-f", "-z"], None),
         (&["-f", "-b", "--fp16"], Some(16)),
         (&["-f", "-b", "--fp8"], Some(8)),
         (&["-f", "--fp4"], Some(4)),
-        (&["-f", "-b", "-c", "full", "-s", "none"], None),
+        (&["-f", "-b", "-c", "none", "-s", "none"], None),
+        (&["-f", "--fpN", "-a", "0.01"], Some(16)),
     ];
-    let mut grids = 0;
-    for name in names {
-        let vdb = testkit::committed("data/edge").join(format!("{name}.vdb"));
-        let wanted = File::open(std::fs::read(&vdb).unwrap()).unwrap().read_all().unwrap();
-        for (options, bits) in encodings {
-            let context = format!("{name} {options:?}");
-            let nvdb = folder.file("x.nvdb");
-            run("nanovdb_convert", options, &[&vdb, &nvdb]);
-            let got = read_back(std::fs::read(&nvdb).unwrap());
-            assert_eq!(got.len(), wanted.len(), "{context}");
-            for want in &wanted {
-                let got = of_name(&got, &want.name);
-                assert_eq!((&got.name, got.grid_class()), (&want.name, want.grid_class()), "{context}");
-                assert_same_transform(&got.transform, &want.transform, &context);
-                let is_finite = |tree: &Tree<f32>| tree.leaves.values.iter().all(|value| value.is_finite());
-                match (bits, want.tree.as_float()) {
-                    (Some(_), Some(tree)) if !is_finite(tree) => continue,
-                    (Some(bits), Some(_)) => {
-                        assert_close(&got.tree, &want.tree, half_quantum(&want.tree, bits), &context);
-                    }
-                    _ => assert_close(&got.tree, &want.tree, |_| 0.0, &context),
+    // All files at once, since starting the converter takes longer than what it does. Within a file it goes
+    // by name.
+    let files = names.map(|name| testkit::committed("data/edge").join(format!("{name}.vdb")));
+    let wanted: Vec<Vec<Grid>> = files
+        .iter()
+        .map(|vdb| {
+            let mut grids = File::open(std::fs::read(vdb).unwrap()).unwrap().read_all().unwrap();
+            grids.sort_by(|a, b| a.name.cmp(&b.name));
+            grids
+        })
+        .collect();
+    let is_finite = |tree: &Tree<f32>| tree.leaves.values.iter().all(|value| value.is_finite());
+    let has_leaves = |grid: &Grid| with_tree!(&*grid.tree, tree => !tree.leaves.is_empty());
+    for (options, bits) in encodings {
+        // The converter of that version trips over trees without leaves when the bits are its own choice.
+        let is_taken = |grids: &[Grid]| !options.contains(&"--fpN") || grids.iter().all(has_leaves);
+        let taken = || files.iter().zip(&wanted).filter(|(_, grids)| is_taken(grids));
+        let nvdb = folder.file("x.nvdb");
+        let mut paths: Vec<&Path> = taken().map(|(file, _)| &**file).collect();
+        paths.push(&nvdb);
+        run("nanovdb_convert", options, &paths);
+        let got = read_back(std::fs::read(&nvdb).unwrap());
+        let wanted: Vec<&Grid> = taken().flat_map(|(_, grids)| grids).collect();
+        assert!(got.len() == wanted.len() && got.len() >= 8, "{options:?}: {} grids", got.len());
+        for (got, want) in got.iter().zip(wanted) {
+            let context = format!("{} {options:?}", want.name);
+            assert_eq!((&got.name, got.grid_class()), (&want.name, want.grid_class()), "{context}");
+            assert_same_transform(&got.transform, &want.transform, &context);
+            match (bits, want.tree.as_float()) {
+                (Some(_), Some(tree)) if !is_finite(tree) => {}
+                (Some(bits), Some(_)) => {
+                    let rounding = half_quantum(&want.tree, bits);
+                    let least = if options.contains(&"--fpN") { 0.010_000_1 } else { 0.0 };
+                    assert_close(&got.tree, &want.tree, |i| rounding(i).max(least), &context);
                 }
-                grids += 1;
-            }
-        }
-        // The converter of that version trips over trees without leaves here.
-        if wanted.iter().any(|grid| with_tree!(&*grid.tree, tree => tree.leaves.is_empty())) {
-            continue;
-        }
-        run("nanovdb_convert", &["-f", "--fpN", "-a", "0.01"], &[&vdb, &folder.file("n.nvdb")]);
-        let got = read_back(std::fs::read(folder.file("n.nvdb")).unwrap());
-        for want in &wanted {
-            if name != "special_values" && want.tree.as_float().is_some() {
-                let tolerance = half_quantum(&want.tree, 16);
-                let got = of_name(&got, &want.name);
-                assert_close(&got.tree, &want.tree, |i| tolerance(i).max(0.0100001), &format!("{name} FpN"));
+                _ => assert_close(&got.tree, &want.tree, |_| 0.0, &context),
             }
         }
     }
-    assert!(grids > 100, "{grids}");
 }
 
 fn of_name<'a>(grids: &'a [Grid], name: &str) -> &'a Grid {
@@ -517,36 +520,35 @@ fn nanovdb_takes_what_we_write_and_finds_the_same_in_it() {
     let back = || File::open(std::fs::read(&vdb).unwrap()).unwrap().read_all().unwrap();
     let encodings =
         [Encoding::Full, Encoding::Fp16, Encoding::Fp8, Encoding::Fp4, Encoding::FpN { max_error: 9.0 }];
-    for seed in 0..6 {
-        for encoding in encodings {
-            let codec = if seed % 2 == 0 { Codec::None } else { Codec::Zip };
-            let mut grids = random_grids(seed);
-            // The converter of that version loses its transposition of the matrix.
-            let diagonal =
-                [[0.5, 0.0, 0.0, 0.0], [0.0, -0.25, 0.0, 0.0], [0.0, 0.0, 2.0, 0.0], [1.0, -2.0, 1e6, 1.0]];
-            grids.iter_mut().for_each(|grid| grid.transform = Transform::affine(diagonal));
-            // Grids go by name, and there are two of floats.
-            grids[8].name += " again";
-            grids[0].name = format!("{}{seed}", "long name ".repeat(30));
-            let context = format!("{seed} {encoding:?}");
-            let bytes = written(&grids, encoding, codec);
-            std::fs::write(&nvdb, &bytes).unwrap();
-            let text = run("nanovdb_validate", &["-v"], &[&nvdb]);
-            assert!(!text.contains("fail"), "{context}: {text}");
-            let text = run("nanovdb_print", &["-l"], &[&nvdb]);
-            assert!(text.contains(&format!("vec3d {seed}")), "{context}: {text}");
-            run("nanovdb_convert", &["-f"], &[&nvdb, &vdb]);
-            // What NanoVDB decodes is what we decode.
-            let ours = read_back(bytes);
-            let theirs = back();
-            assert_eq!(theirs.len(), grids.len(), "{context}");
-            for ours in &ours {
-                let theirs = of_name(&theirs, &ours.name);
-                let context = format!("{context} {}", ours.name);
-                assert_eq!((&theirs.name, theirs.grid_class()), (&ours.name, ours.grid_class()), "{context}");
-                assert_same_transform(&theirs.transform, &ours.transform, &context);
-                assert_close(&theirs.tree, &ours.tree, |_| 0.0, &context);
-            }
+    // The converter of that version loses its transposition of the matrix.
+    let diagonal =
+        [[0.5, 0.0, 0.0, 0.0], [0.0, -0.25, 0.0, 0.0], [0.0, 0.0, 2.0, 0.0], [1.0, -2.0, 1e6, 1.0]];
+    let mut grids: Vec<Grid> = (0..2).flat_map(random_grids).collect();
+    for (i, grid) in grids.iter_mut().enumerate() {
+        grid.transform = Transform::affine(diagonal);
+        grid.name += &format!(" {i}");
+    }
+    grids[0].name = "long name ".repeat(30);
+    for (i, encoding) in encodings.into_iter().enumerate() {
+        let codec = if i % 2 == 0 { Codec::None } else { Codec::Zip };
+        let context = format!("{encoding:?}");
+        let bytes = written(&grids, encoding, codec);
+        std::fs::write(&nvdb, &bytes).unwrap();
+        let text = run("nanovdb_validate", &["-v"], &[&nvdb]);
+        assert_eq!(text.matches("passed").count(), grids.len(), "{context}: {text}");
+        let text = run("nanovdb_print", &["-l"], &[&nvdb]);
+        assert!(text.contains(&grids[7].name), "{context}: {text}");
+        run("nanovdb_convert", &["-f"], &[&nvdb, &vdb]);
+        // What NanoVDB decodes is what we decode.
+        let ours = read_back(bytes);
+        let theirs = back();
+        assert_eq!(theirs.len(), grids.len(), "{context}");
+        for ours in &ours {
+            let theirs = of_name(&theirs, &ours.name);
+            let context = format!("{context} {}", ours.name);
+            assert_eq!((&theirs.name, theirs.grid_class()), (&ours.name, ours.grid_class()), "{context}");
+            assert_same_transform(&theirs.transform, &ours.transform, &context);
+            assert_close(&theirs.tree, &ours.tree, |_| 0.0, &context);
         }
     }
 }

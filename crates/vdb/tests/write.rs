@@ -173,7 +173,7 @@ where
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(150))]
+    #![proptest_config(ProptestConfig::with_cases(40))]
 
     #[test]
     fn random_trees_of_every_type_come_back(recipe in recipes()) {

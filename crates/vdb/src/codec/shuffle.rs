@@ -65,7 +65,7 @@ pub(super) fn shuffle_bytes(typesize: usize, src: &[u8], out: &mut [u8]) {
     }
     match typesize {
         2 => shuffle_array::<2>(src, out),
-        4 => shuffle_array::<4>(src, out),
+        4 => shuffle_4(src, out),
         8 => shuffle_array::<8>(src, out),
         _ => {
             for (byte, plane) in out.chunks_exact_mut(count).enumerate() {
@@ -83,6 +83,31 @@ fn shuffle_array<const N: usize>(src: &[u8], out: &mut [u8]) {
         for (value, element) in plane.iter_mut().zip(elements) {
             *value = element[byte];
         }
+    }
+}
+
+/// Takes pairs apart in a strip and then the bytes of the pairs, as [`unshuffle_4`] does the reverse.
+fn shuffle_4(src: &[u8], out: &mut [u8]) {
+    const STRIP: usize = 64;
+    let count = src.len() / 4;
+    let (p01, p23) = out.split_at_mut(2 * count);
+    let (p0, p1) = p01.split_at_mut(count);
+    let (p2, p3) = p23.split_at_mut(count);
+    let (mut low, mut high) = ([0_u16; STRIP], [0_u16; STRIP]);
+    let unpair = |pairs: &[u16; STRIP], a: &mut [u8], b: &mut [u8]| {
+        for ((pair, a), b) in pairs.iter().zip(a).zip(b) {
+            [*a, *b] = pair.to_le_bytes();
+        }
+    };
+    let planes =
+        p0.chunks_mut(STRIP).zip(p1.chunks_mut(STRIP)).zip(p2.chunks_mut(STRIP)).zip(p3.chunks_mut(STRIP));
+    for (elements, (((a, b), c), d)) in src.chunks(4 * STRIP).zip(planes) {
+        for ((element, low), high) in elements.as_chunks::<4>().0.iter().zip(&mut low).zip(&mut high) {
+            let element = u32::from_le_bytes(*element);
+            (*low, *high) = (element as u16, (element >> 16) as u16);
+        }
+        unpair(&low, a, b);
+        unpair(&high, c, d);
     }
 }
 

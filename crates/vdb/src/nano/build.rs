@@ -1,7 +1,7 @@
 //! From a tree to a grid's bytes: where each node goes, what the root, the tree and the grid say of them.
 //!
-//! Nodes stand breadth first: root, upper nodes, lower nodes, leaves, each level in OpenVDB's order. The bytes of
-//! single nodes are made in `encode`.
+//! Nodes stand breadth first: root, upper nodes, lower nodes, leaves, each level in OpenVDB's order. The
+//! bytes of single nodes are made in `encode`.
 
 use flate2::Crc;
 
@@ -283,8 +283,8 @@ fn affine(grid: &Grid) -> Result<&Matrix4> {
     })
 }
 
-/// The box of all active values in the world, voxels counted in full from their corner as NanoVDB does; of none the
-/// largest box turned inside out.
+/// The box of all active values in the world, voxels counted in full from their corner as NanoVDB does; of
+/// none the largest box turned inside out.
 fn world_box(grid: &Grid, bbox: Option<IndexBox>) -> [[f64; 3]; 2] {
     let [mut low, mut high] = [[f64::MAX; 3], [f64::MIN; 3]];
     let Some([min, max]) = bbox else { return [low, high] };
@@ -309,11 +309,10 @@ fn inverse(m: &Matrix4) -> Option<Matrix4> {
         m[r0][c0] * m[r1][c1] - m[r0][c1] * m[r1][c0]
     };
     let determinant: f64 = (0..3).map(|column| m[0][column] * minor(0, column)).sum();
-    let mut inverse = [[0.0; 4]; 4];
-    for row in 0..3 {
-        for column in 0..3 {
-            inverse[row][column] = minor(column, row) / determinant;
-        }
-    }
+    let entry = |row: usize, column: usize| match row.max(column) {
+        0..3 => minor(column, row) / determinant,
+        _ => 0.0,
+    };
+    let inverse: Matrix4 = std::array::from_fn(|row| std::array::from_fn(|column| entry(row, column)));
     inverse.as_flattened().iter().all(|x| x.is_finite()).then_some(inverse)
 }

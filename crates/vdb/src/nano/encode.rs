@@ -49,7 +49,8 @@ pub(super) fn leaf<V: NanoValue>(tree: &Tree<V>, i: usize, bytes: &mut [u8]) -> 
     }
 }
 
-/// Writes a leaf as codes to bytes that are zero. Its statistics are those of the values that the codes stand for.
+/// Writes a leaf as codes to bytes that are zero. Its statistics are those of the values that the codes stand
+/// for.
 pub(super) fn quantised_leaf(
     tree: &Tree<f32>,
     i: usize,
@@ -109,8 +110,8 @@ pub(super) struct Written<V> {
     pub(super) stats: NodeStats<V>,
 }
 
-/// Writes an inner node that stands at `at` to bytes that are zero. Its children are given in the order of the mask.
-/// Gives its statistics and the number of its active tiles.
+/// Writes an inner node that stands at `at` to bytes that are zero. Its children are given in the order of
+/// the mask. Gives its statistics and the number of its active tiles.
 pub(super) fn node<V: NanoValue>(
     node: &InternalNode<V>,
     branching: Branching,

@@ -1,7 +1,8 @@
 //! Opening `.nvdb` files: segments, what they say of each grid, and a grid's bytes without compression.
 //!
-//! A file is a row of segments, and a segment a header, a description of each grid with its name, and the grids; a
-//! file can also be nothing but grids one after the other. What a grid's bytes mean lives in `read` and `layout`.
+//! A file is a row of segments, and a segment a header, a description of each grid with its name, and the
+//! grids; a file can also be nothing but grids one after the other. What a grid's bytes mean lives in `read`
+//! and `layout`.
 
 use std::borrow::Cow;
 use std::io::Read;
@@ -46,7 +47,8 @@ pub struct GridInfo {
     pub name: String,
     /// The type of the values as NanoVDB calls it: `float`, `Vec3f`, `Fp8`, `OnIndex`, …
     pub value_type: &'static str,
-    /// `"level set"`, `"fog volume"`, `"staggered"` or `"unknown"`, which includes classes that `.vdb` files lack.
+    /// `"level set"`, `"fog volume"`, `"staggered"` or `"unknown"`, which includes classes that `.vdb` files
+    /// lack.
     pub grid_class: &'static str,
     /// The version of the format: major, minor, patch.
     pub version: [u32; 3],
@@ -117,12 +119,12 @@ impl<S: Source> File<S> {
         self.grids.iter().position(|grid| grid.name == name)
     }
 
-    /// Reads the voxels of grid `index`, without reading those of any other. Quantised and 16-bit values come in the
-    /// types that hold them exactly: `float` and `int32`.
+    /// Reads the voxels of grid `index`, without reading those of any other. Quantised and 16-bit values come
+    /// in the types that hold them exactly: `float` and `int32`.
     ///
     /// # Errors
-    /// If the source fails, the bytes are damaged, the type of the grid is not supported, a limit is passed, or there
-    /// is no such grid.
+    /// If the source fails, the bytes are damaged, the type of the grid is not supported, a limit is passed,
+    /// or there is no such grid.
     pub fn read_grid(&self, index: usize) -> Result<Grid> {
         let info = self
             .grids
@@ -160,8 +162,8 @@ fn memory_size(bytes: u64) -> Result<usize> {
 }
 
 fn check_version(version: u32) -> Result<[u32; 3]> {
-    // Versions before 32.3 were never part of a release of that major version, later ones may differ in ways that
-    // nobody knows yet.
+    // Versions before 32.3 were never part of a release of that major version, later ones may differ in ways
+    // that nobody knows yet.
     match layout::unpack_version(version) {
         known @ [32, 3..=9, _] => Ok(known),
         [major, minor, patch] => {
@@ -284,9 +286,8 @@ fn bare_grids(reader: &mut Reader<'_>, grids: &mut Vec<GridInfo>, budget: &mut B
         }
         reader.seek(at(layout::TREE_VOXEL_COUNT));
         let active_voxels = reader.u64("the number of active voxels")?;
-        let inside =
-            |offset: i64, from: u64| from.checked_add_signed(offset).filter(|at| *at - begin < size_bytes);
-        let root = inside(root_at, at(layout::TREE)).filter(|root| *root >= begin);
+        let root = at(layout::TREE).checked_add_signed(root_at);
+        let root = root.filter(|root| root.checked_sub(begin).is_some_and(|root| root < size_bytes));
         reader.seek(root.ok_or_else(|| Error::malformed(begin, "the root stands outside of the grid"))?);
         let active_bbox = index_box(reader)?;
         if flags & layout::HAS_LONG_NAME != 0 {

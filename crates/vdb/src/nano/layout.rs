@@ -1,8 +1,8 @@
 //! What stands where in a NanoVDB grid: the structures' fields as byte offsets.
 //!
-//! A grid begins with its own fixed structure and that of the tree. The root, the two kinds of inner nodes and the
-//! leaves are found by offsets relative to the structure that names them; the places of their fields depend on the
-//! type of the values, as a C++ compiler lays them out. Nothing here reads or writes bytes.
+//! A grid begins with its own fixed structure and that of the tree. The root, the two kinds of inner nodes
+//! and the leaves are found by offsets relative to the structure that names them; the places of their fields
+//! depend on the type of the values, as a C++ compiler lays them out. Nothing here reads or writes bytes.
 
 use crate::tree::{LEAF_VOXELS, LEVEL4, LEVEL5};
 
@@ -44,9 +44,11 @@ pub(super) const GRID_TYPE: usize = 636;
 pub(super) const GRID_BLIND: usize = 640;
 pub(super) const GRID_BYTES: usize = 672;
 
-/// The tree follows the grid: offsets of the first leaf, lower, upper node and of the root, relative to the tree …
+/// The tree follows the grid: offsets of the first leaf, lower, upper node and of the root, relative to the
+/// tree …
 pub(super) const TREE: usize = GRID_BYTES;
-/// … then the numbers of leaves, lower and upper nodes, of active tiles in lower nodes, upper nodes and the root …
+/// … then the numbers of leaves, lower and upper nodes, of active tiles in lower nodes, upper nodes and the
+/// root …
 pub(super) const TREE_NODE_COUNTS: usize = TREE + 32;
 /// … and of active voxels.
 pub(super) const TREE_VOXEL_COUNT: usize = TREE + 56;
@@ -129,7 +131,8 @@ impl Kind {
             .find(|kind| kind.number() == number)
     }
 
-    /// The bits of a voxel's code; `None` for types that are not quantised, and for `FpN`, whose leaves say it.
+    /// The bits of a voxel's code; `None` for types that are not quantised, and for `FpN`, whose leaves say
+    /// it.
     pub(super) fn code_bits(self) -> Option<u32> {
         match self {
             Kind::Fp4 => Some(4),
@@ -330,8 +333,9 @@ mod tests {
 
     #[test]
     fn structures_are_laid_out_as_a_compiler_lays_them_out() {
-        // Root, its background, deviation, tile and tile's value; upper node, its table and average; lower node, its
-        // table and deviation; leaf: from `sizeof` and `offsetof` of the headers of version 32.4 on x86-64.
+        // Root, its background, deviation, tile and tile's value; upper node, its table and average; lower
+        // node, its table and deviation; leaf: from `sizeof` and `offsetof` of the headers of version 32.4 on
+        // x86-64.
         let wanted: [(Kind, [usize; 12]); 13] = [
             (Kind::Float, [64, 28, 44, 32, 20, 270400, 8256, 8232, 33856, 1088, 1068, 2144]),
             (Kind::Double, [96, 32, 64, 32, 24, 270400, 8256, 8240, 33856, 1088, 1080, 4224]),

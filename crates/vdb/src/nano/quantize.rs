@@ -1,7 +1,8 @@
-//! Codes of quantised leaves: floats as whole numbers of 1 to 16 bits, counted in quanta from the leaf's minimum.
+//! Codes of quantised leaves: floats as whole numbers of 1 to 16 bits, counted in quanta from the leaf's
+//! minimum.
 //!
-//! A code stands for `minimum + code * quantum`, in single precision. Where minimum and codes stand in a leaf is said
-//! in `layout`.
+//! A code stands for `minimum + code * quantum`, in single precision. Where minimum and codes stand in a leaf
+//! is said in `layout`.
 
 use super::layout::code_bytes;
 use crate::tree::LEAF_VOXELS;
@@ -17,8 +18,8 @@ pub(super) struct Quantizer {
 }
 
 impl Quantizer {
-    /// The mapping that covers all values of a leaf with codes of that many bits, 16 at most. `None` if they are not
-    /// all finite, or further apart than a float can say.
+    /// The mapping that covers all values of a leaf with codes of that many bits, 16 at most. `None` if they
+    /// are not all finite, or further apart than a float can say.
     pub(super) fn covering(values: &[f32], bits: u32) -> Option<Self> {
         let minimum = values.iter().copied().fold(f32::INFINITY, f32::min);
         let maximum = values.iter().copied().fold(f32::NEG_INFINITY, f32::max);
@@ -53,8 +54,8 @@ impl Quantizer {
     }
 }
 
-/// The fewest bits, of 1, 2, 4, 8 and 16, whose codes keep all values of a leaf within that error, or 16 if none do.
-/// `None` as in [`Quantizer::covering`].
+/// The fewest bits, of 1, 2, 4, 8 and 16, whose codes keep all values of a leaf within that error, or 16 if
+/// none do. `None` as in [`Quantizer::covering`].
 pub(super) fn narrowest(values: &[f32], max_error: f32) -> Option<Quantizer> {
     for bits in [1, 2, 4, 8] {
         let quantizer = Quantizer::covering(values, bits)?;
@@ -117,7 +118,8 @@ mod tests {
 
         #[test]
         fn no_value_moves_by_more_than_half_a_quantum(
-            values in proptest::collection::vec(-1000.0_f32..1000.0, 512), bits in prop::sample::select(vec![4, 8, 16]),
+            values in proptest::collection::vec(-1000.0_f32..1000.0, 512),
+            bits in prop::sample::select(vec![4, 8, 16]),
         ) {
             let quantizer = Quantizer::covering(&values, bits).unwrap();
             for value in values {

@@ -1,9 +1,10 @@
 //! From a grid's bytes to its tree.
 //!
-//! Nodes are found by offsets that nobody has checked. Each is followed from the level above and only ever downward,
-//! so that there are no cycles, and more nodes than the grid's bytes could hold are refused, so that a node that is
-//! named again and again does not grow without bound. Where a node stands in space follows from its parent; the boxes
-//! in the file, which NanoVDB leaves without an origin in nodes without active values, are not used.
+//! Nodes are found by offsets that nobody has checked. Each is followed from the level above and only ever
+//! downward, so that there are no cycles, and more nodes than the grid's bytes could hold are refused, so
+//! that a node that is named again and again does not grow without bound. Where a node stands in space
+//! follows from its parent; the boxes in the file, which NanoVDB leaves without an origin in nodes without
+//! active values, are not used.
 
 use super::layout::{self, Kind, Layout, NodeLayout};
 use super::quantize;
@@ -107,16 +108,14 @@ impl<'a> GridBytes<'a> {
 }
 
 fn transform(bytes: GridBytes<'_>) -> Result<Transform> {
-    let number = |i: usize| bytes.f64(layout::GRID_MAP_F64 + 8 * i, "the map of a grid");
-    let mut matrix = [[0.0; 4]; 4];
-    for column in 0..3 {
-        // Vectors are columns there and rows here.
-        for row in 0..3 {
-            matrix[row][column] = number(3 * column + row)?;
-        }
-        matrix[3][column] = number(layout::MAP_TRANSLATION + column)?;
+    let mut numbers = [0.0; layout::MAP_TRANSLATION + 3];
+    for (i, number) in numbers.iter_mut().enumerate() {
+        *number = bytes.f64(layout::GRID_MAP_F64 + 8 * i, "the map of a grid")?;
     }
-    matrix[3][3] = 1.0;
+    // Vectors are columns there and rows here.
+    let row = |i: usize| [numbers[i], numbers[3 + i], numbers[6 + i], 0.0];
+    let [.., x, y, z] = numbers;
+    let matrix = [row(0), row(1), row(2), [x, y, z, 1.0]];
     let uniform = Transform::uniform_scale(matrix[0][0]);
     Ok(if uniform.matrix() == Some(&matrix) { uniform } else { Transform::affine(matrix) })
 }
@@ -135,7 +134,8 @@ struct Walk<'a, 'b> {
     budget: &'b mut Budget,
 }
 
-/// Decodes the bytes of a leaf, whose codes have so many bits if it has any, into what a tree stores of it.
+/// Decodes the bytes of a leaf, whose values begin at `value_at` if they are plain, into what a tree stores
+/// of it.
 type DecodeLeaf<V> = fn(leaf: &[u8], value_at: usize, stored: LeafValues<&mut [V], &mut [u64]>);
 
 impl Walk<'_, '_> {

@@ -1,7 +1,7 @@
 //! What NanoVDB nodes say of the active values in and below them: box, extremes, average, deviation.
 //!
-//! Of vectors, NanoVDB compares the squared lengths, and gives the average and deviation of those; so do we. The
-//! statistics of whole grids that `.vdb` tools print live in [`crate::Statistics`].
+//! Of vectors, NanoVDB compares the squared lengths, and gives the average and deviation of those; so do we.
+//! The statistics of whole grids that `.vdb` tools print live in [`crate::Statistics`].
 
 use super::layout::{Kind, StatsLayout};
 use crate::stats::{IndexBox, grow};
@@ -204,7 +204,8 @@ mod tests {
 
         #[test]
         fn parts_add_up_to_the_whole(
-            values in proptest::collection::vec(-10.0_f64..10.0, 2..200), cut in 0_usize..200, tile in -10.0_f64..10.0,
+            values in proptest::collection::vec(-10.0_f64..10.0, 2..200),
+            cut in 0_usize..200, tile in -10.0_f64..10.0,
         ) {
             let cut = cut.min(values.len());
             let part = |values: &[f64]| NodeStats::of_voxels(values.iter().copied(), None);

@@ -1,6 +1,7 @@
 //! Writing `.nvdb` files: the choice of an encoding for each grid, and the frame around the grids.
 //!
-//! Each grid gets a segment of its own, so that only one is in memory at a time. Its bytes are made in `build`.
+//! Each grid gets a segment of its own, so that only one is in memory at a time. Its bytes are made in
+//! `build`.
 
 use std::io::Write;
 
@@ -17,7 +18,8 @@ use crate::any::{AnyTree, Grid};
 use crate::error::{Error, Result};
 use crate::tree::{Shape, Tree};
 
-/// How the voxels of float grids are stored. Tiles, the background and grids of other types are always in full width.
+/// How the voxels of float grids are stored. Tiles, the background and grids of other types are always in
+/// full width.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub enum Encoding {
     /// As they are.
@@ -29,7 +31,8 @@ pub enum Encoding {
     Fp8,
     /// 4 bits per voxel.
     Fp4,
-    /// The fewest of 1, 2, 4, 8 and 16 bits, leaf by leaf, that keep all values within an error; 16 if none do.
+    /// The fewest of 1, 2, 4, 8 and 16 bits, leaf by leaf, that keep all values within an error; 16 if none
+    /// do.
     FpN {
         /// The largest difference between a value and what is stored for it.
         max_error: f32,
@@ -45,15 +48,15 @@ pub struct WriteOptions {
     pub codec: Codec,
 }
 
-/// Writes grids as a NanoVDB file of version 32.4: `float`, `double`, `int32`, `int64`, `bool`, `mask`, `vec3s` and
-/// `vec3d` as what they are, `half` as `float`. Of the metadata only the class is kept, where NanoVDB allows it with
-/// that type of values. The same grids give the same bytes.
+/// Writes grids as a NanoVDB file of version 32.4: `float`, `double`, `int32`, `int64`, `bool`, `mask`,
+/// `vec3s` and `vec3d` as what they are, `half` as `float`. Of the metadata only the class is kept, where
+/// NanoVDB allows it with that type of values. The same grids give the same bytes.
 ///
 /// # Errors
-/// [`Error::Unsupported`] for other types, trees of another shape than the standard one, transforms that are not
-/// affine, and [`Codec::Blosc`]. [`Error::Misuse`] if there are no grids, a name has a zero in it, a transform has no
-/// inverse, or a leaf cannot be quantised because its values are not all finite or too far apart. [`Error::Io`] if
-/// `out` fails.
+/// [`Error::Unsupported`] for other types, trees of another shape than the standard one, transforms that are
+/// not affine, and [`Codec::Blosc`]. [`Error::Misuse`] if there are no grids, a name has a zero in it, a
+/// transform has no inverse, or a leaf cannot be quantised because its values are not all finite or too far
+/// apart. [`Error::Io`] if `out` fails.
 pub fn write(grids: &[Grid], options: &WriteOptions, out: &mut dyn Write) -> Result<()> {
     if grids.is_empty() {
         return Err(Error::Misuse("a NanoVDB file cannot be without grids".into()));
@@ -114,7 +117,7 @@ fn float(grid: &Grid, tree: &Tree<f32>, encoding: Encoding) -> Result<Vec<u8>> {
         };
         found.ok_or_else(|| {
             Error::Misuse(format!(
-                "the leaf at {:?} of grid '{}' cannot be quantised: its values are not all finite, or too far apart",
+                "the leaf at {:?} of grid '{}' cannot be quantised: not all finite, or too far apart",
                 tree.leaves.origins[i], grid.name
             ))
         })

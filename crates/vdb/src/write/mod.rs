@@ -212,3 +212,43 @@ fn append_count(count: usize, bytes: &mut Vec<u8>) -> Result<()> {
     bytes.extend_from_slice(&count.to_le_bytes());
     Ok(())
 }
+
+#[cfg(all(test, feature = "parallel"))]
+mod tests {
+    use super::*;
+    use crate::build::TreeBuilder;
+    use crate::transform::Transform;
+    use crate::tree::Shape;
+
+    #[test]
+    fn any_number_of_threads_writes_the_same_bytes() {
+        let mut builder = TreeBuilder::new(0.5_f32, Shape::STANDARD);
+        for leaf in 0..1000_i32 {
+            let value = |i: i32| ((i * i + leaf) % 97) as f32 * 0.1;
+            let values: Vec<f32> = (0..512).map(value).collect();
+            builder.leaf([leaf % 31 * 8, leaf / 31 * 8, leaf % 7 * 640], &[u64::MAX / 3; 8], &values);
+        }
+        let grid = Grid {
+            name: "a".into(),
+            metadata: Metadata::default(),
+            transform: Transform::identity(),
+            save_float_as_half: false,
+            tree: Arc::new(builder.build().unwrap().into()),
+        };
+        for compression in [Compression::BLOSC, Compression::ZIP] {
+            let bytes = |threads| {
+                let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+                let mut bytes = Vec::new();
+                let grids = std::slice::from_ref(&grid);
+                let options = WriteOptions { compression };
+                pool.install(|| write(grids, &Metadata::default(), &options, &mut bytes)).unwrap();
+                bytes
+            };
+            let one = bytes(1);
+            assert!(one.len() > 100_000);
+            for threads in [2, 5] {
+                assert!(bytes(threads) == one, "{threads} threads");
+            }
+        }
+    }
+}

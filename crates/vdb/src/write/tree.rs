@@ -5,7 +5,8 @@
 use super::block::{BlockEncoder, append_mask, rounded};
 use super::parallel::in_order;
 use crate::block::BlockFormat;
-use crate::tree::{Leaves, Tiles, Tree};
+use crate::mask::bits;
+use crate::tree::{InternalNode, Leaves, Tiles, Tree};
 use crate::value::{LeafValues, Value};
 
 /// How many leaves a thread encodes at a time.
@@ -86,14 +87,9 @@ pub(super) fn content_hash<V: Value>(tree: &Tree<V>) -> u64 {
         hash = coord_hash(hash, tile.origin);
         hash = mix(mix(hash, tile.value.hash_bits()), tile.active.into());
     }
-    for node in tree.levels.iter().flatten() {
-        hash = coord_hash(hash, node.origin);
-        let words = node.child_mask.words().iter().chain(node.value_mask.words());
-        hash = words.fold(hash, |hash, word| mix(hash, *word));
-        hash = match &node.tiles {
-            Tiles::Uniform(value) => mix(hash, value.hash_bits()),
-            Tiles::PerSlot(values) => lanes_hash(hash, values, |value| value.hash_bits()),
-        };
+    for nodes in &tree.levels {
+        let of_nodes = in_order(nodes.len(), || (), |(), i| node_hash(&nodes[i]));
+        hash = of_nodes.into_iter().fold(hash, mix);
     }
     let tasks = leaves.len().div_ceil(LEAVES_PER_TASK);
     let of_leaves = in_order(
@@ -114,6 +110,26 @@ pub(super) fn content_hash<V: Value>(tree: &Tree<V>) -> u64 {
         },
     );
     of_leaves.into_iter().fold(hash, mix)
+}
+
+/// What stands at children makes no difference, since it is not written.
+fn node_hash<V: Value>(node: &InternalNode<V>) -> u64 {
+    let mut hash = coord_hash(0, node.origin);
+    for (child, on) in node.child_mask.words().iter().zip(node.value_mask.words()) {
+        hash = mix(mix(hash, *child), on & !child);
+    }
+    match &node.tiles {
+        Tiles::Uniform(value) => mix(hash, value.hash_bits()),
+        Tiles::PerSlot(values) => {
+            let words = values.chunks(64).zip(node.child_mask.words());
+            words.fold(hash, |hash, (values, children)| match children {
+                0 => lanes_hash(hash, values, |value| value.hash_bits()),
+                _ => bits(!children)
+                    .filter_map(|i| values.get(i))
+                    .fold(hash, |h, value| mix(h, value.hash_bits())),
+            })
+        }
+    }
 }
 
 fn mix(hash: u64, bits: u64) -> u64 {
