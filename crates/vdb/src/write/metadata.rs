@@ -60,7 +60,7 @@ fn openvdb_memory_bytes(tree: &AnyTree) -> i64 {
         }
         let voxels = tree.leaves.leaf_voxels;
         let mask_bytes = voxels / 8;
-        let alignment = mask_bytes.min(8).max(4);
+        let alignment = mask_bytes.clamp(4, 8);
         let leaf = match V::leaf(&[]) {
             // A buffer's pointer and flags, mask, origin and a number; the values stand elsewhere.
             LeafValues::Plain(_) => {
