@@ -340,9 +340,9 @@ fn trees_that_are_none_are_refused_before_a_byte_is_written() {
     let good = builder.build().unwrap();
     let breaks: [fn(&mut Tree<f32>); 12] = [
         |tree| drop(tree.levels.pop()),
-        |tree| drop(tree.leaves.masks.pop()),
-        |tree| drop(tree.leaves.values.pop()),
-        |tree| drop(tree.leaves.origins.pop()),
+        |tree| _ = tree.leaves.masks.pop(),
+        |tree| _ = tree.leaves.values.pop(),
+        |tree| _ = tree.leaves.origins.pop(),
         |tree| tree.leaves.leaf_voxels = 64,
         |tree| tree.levels[1][0].first_child = usize::MAX,
         |tree| tree.levels[1][1].first_child = 0,
