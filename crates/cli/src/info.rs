@@ -47,7 +47,7 @@ const HISTOGRAM_INTERVALS: usize = 32;
 /// What became known of a grid's voxels.
 pub(crate) enum Contents {
     /// All of this.
-    Decoded(Decoded),
+    Decoded(Box<Decoded>),
     /// Nothing: values of this type are not read.
     NotDecoded,
     /// Nothing, and this is why.
@@ -154,7 +154,7 @@ fn show_nano(
         let contents = match info.is_readable() {
             false => Contents::NotDecoded,
             true => match file.read_grid(index) {
-                Ok(grid) => Contents::Decoded(decoded(&grid.tree, args.hash)),
+                Ok(grid) => Contents::Decoded(Box::new(decoded(&grid.tree, args.hash))),
                 Err(error) => Contents::Damaged(explain(&error)),
             },
         };
@@ -187,7 +187,7 @@ fn look_into<S: Source>(file: &File<S>, index: usize, with_hashes: bool) -> Cont
         return Contents::NotDecoded;
     }
     match file.read_grid(index) {
-        Ok(grid) => Contents::Decoded(decoded(&grid.tree, with_hashes)),
+        Ok(grid) => Contents::Decoded(Box::new(decoded(&grid.tree, with_hashes))),
         Err(error) => Contents::Damaged(explain(&error)),
     }
 }

@@ -225,7 +225,7 @@ fn a_grid_that_is_not_named_well_is_answered_with_the_names() {
     let empty = run(nuage().arg("probe").arg(edge("no_grids.vdb")).args(["0", "0", "0"]));
     assert!(stderr(&empty).contains("no grids") && empty.status.code() == Some(1));
     let points = run(nuage().arg("probe").arg(edge("points.vdb")).args(["--grid", "points", "0", "0", "0"]));
-    assert_eq!(points.status.code(), Some(1), "{points:?}");
+    assert!(points.status.success(), "{points:?}");
 }
 
 #[test]
@@ -265,7 +265,7 @@ fn a_damaged_grid_hides_neither_its_header_nor_the_other_grids() {
         stderr(&output)
     );
     assert_eq!(stdout(&output).matches("cannot be read").count(), 1);
-    assert_eq!(stdout(&output).matches("active voxels").count(), 3);
+    assert_eq!(stdout(&output).lines().filter(|line| line.starts_with("  active voxels")).count(), 3);
 
     let output = run(nuage().args(["info", "--json"]).arg(&file));
     assert_eq!(output.status.code(), Some(1));
@@ -300,8 +300,7 @@ fn info_for_people_tells_what_the_file_holds() {
         "nodes root 1, 32³ 2, 16³ 2, leaves of 8³ 47",
         "active box [-5, 9, 101] to [19, 33, 125], 25 × 25 × 25 voxels",
         "pos: [1, 2, 3]",
-        "values not shown: values of type vec3s are not decoded yet",
-        "active box [0, 0, 0] to [20, 20, 20], 21 × 21 × 21 voxels (from the metadata)",
+        "active box [0, 0, 0] to [20, 20, 20], 21 × 21 × 21 voxels",
     ] {
         assert!(words.contains(part), "{part}\n{}", stdout(&output));
     }

@@ -209,14 +209,18 @@ impl<S: Source> File<S> {
             true => Ok(owner),
             false => Err(Error::malformed(
                 info.tree_range[0],
-                format!("the grid '{name}' that '{}' shares its tree with has another type", info.unique_name),
+                format!(
+                    "the grid '{name}' that '{}' shares its tree with has another type",
+                    info.unique_name
+                ),
             )),
         }
     }
 
     fn read_tree(&self, info: &GridInfo, bbox: Option<IndexBox>) -> Result<AnyTree> {
-        let unsupported =
-            || Error::unsupported(format!("grids of type '{}' (grid '{}')", info.grid_type, info.unique_name));
+        let unsupported = || {
+            Error::unsupported(format!("grids of type '{}' (grid '{}')", info.grid_type, info.unique_name))
+        };
         let shape = info.shape().ok_or_else(unsupported)?;
         let mut budget = Budget::new(&self.limits);
         let mut reader = Reader::new(&self.source, info.tree_range[0], info.tree_range[1])?;

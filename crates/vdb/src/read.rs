@@ -423,7 +423,9 @@ fn decode_leaf<V: Value>(
             block.decode(reader, format, tree.background, mask, out, scratch)
         }
         LeafValues::Bits(out) if format.file_version >= BOOL_BITS_SINCE => {
-            for (word, bytes) in out.iter_mut().zip(reader.take(voxels / 8, "the values of a leaf")?.chunks(8)) {
+            for (word, bytes) in
+                out.iter_mut().zip(reader.take(voxels / 8, "the values of a leaf")?.chunks(8))
+            {
                 *word = bytes.iter().rev().fold(0, |word, byte| word << 8 | u64::from(*byte));
             }
             Ok(())

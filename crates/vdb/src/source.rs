@@ -130,8 +130,7 @@ impl<'a> Reader<'a> {
     ///
     /// The caller has checked that they lie before the end.
     pub(crate) fn load(&mut self, at: u64, len: usize) -> Result<()> {
-        let is_loaded = at >= self.window_at
-            && at - self.window_at + len as u64 <= self.window.len() as u64;
+        let is_loaded = at >= self.window_at && at - self.window_at + len as u64 <= self.window.len() as u64;
         if let (false, Some(source)) = (is_loaded, self.source) {
             let window = (len.max(WINDOW_BYTES) as u64).min(self.end.saturating_sub(at)).max(len as u64);
             self.window = source.range(at, window as usize)?;

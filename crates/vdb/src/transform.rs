@@ -147,7 +147,8 @@ impl Transform {
                 let index_box = match file_version {
                     FLOAT_BOX_SINCE.. => [reader.vec3d("a frustum's box")?, reader.vec3d("a frustum's box")?],
                     _ => {
-                        let mut corner = || -> Result<[f64; 3]> { Ok(reader.coord("a frustum's box")?.map(f64::from)) };
+                        let mut corner =
+                            || -> Result<[f64; 3]> { Ok(reader.coord("a frustum's box")?.map(f64::from)) };
                         [corner()?, corner()?]
                     }
                 };

@@ -176,8 +176,7 @@ impl<V: Value> Tiles<V> {
     /// The tiles of a node from a value per slot, of which those at children say nothing: one value if all tiles
     /// agree on it to the bit, else all of them.
     pub(crate) fn pack(values: &[V], child_mask: &Mask, background: V) -> Self {
-        let mut tiles =
-            (0..values.len()).filter(|slot| !child_mask.contains(*slot)).map(|slot| values[slot]);
+        let mut tiles = (0..values.len()).filter(|slot| !child_mask.contains(*slot)).map(|slot| values[slot]);
         let Some(first) = tiles.next() else { return Tiles::Uniform(background) };
         match tiles.all(|value| value.same_bits(first)) {
             true => Tiles::Uniform(first),

@@ -80,7 +80,8 @@ fn check_tree(tree: &AnyTree, want: &Value, context: &str) {
         None if is_single => f64::from(testkit::number(v) as f32),
         None => testkit::number(v),
     };
-    let numbers = |v: &Value| v.as_array().map_or_else(|| vec![number(v)], |v| v.iter().map(number).collect());
+    let numbers =
+        |v: &Value| v.as_array().map_or_else(|| vec![number(v)], |v| v.iter().map(number).collect());
     let same = |got: &[f64], want: &[f64]| {
         got.len() == want.len() && got.iter().zip(want).all(|(a, b)| testkit::same(*a, *b))
     };
@@ -126,7 +127,9 @@ fn check_tree(tree: &AnyTree, want: &Value, context: &str) {
         None => assert_eq!(min_max, None, "{context}"),
     }
     if let Some(sums) = want.get("sum_active_voxels").filter(|_| stats.nan_count == 0) {
-        let sums = sums.as_array().map_or_else(|| vec![testkit::number(sums)], |v| v.iter().map(testkit::number).collect());
+        let sums = sums
+            .as_array()
+            .map_or_else(|| vec![testkit::number(sums)], |v| v.iter().map(testkit::number).collect());
         for (component, sum) in stats.components.iter().zip(sums) {
             let close = (component.sum - sum).abs() <= 1e-6 * sum.abs().max(component.sum_of_squares.sqrt());
             assert!(close || testkit::same(component.sum, sum), "{context}: sum {} not {sum}", component.sum);
