@@ -33,17 +33,19 @@ pub fn named_grid<S: Source>(file: &File<S>, name: &str) -> Result<usize, Select
     })
 }
 
+/// Whether a grid can become a medium: floating-point numbers on a tree of the standard shape.
+pub fn is_drawable(grid: &GridInfo) -> bool {
+    matches!(grid.value_type(), "float" | "half" | "double") && grid.shape() == Some(Shape::STANDARD)
+}
+
 /// The grid to draw when none is named: `density`, else the first fog volume, else the first level set, else
 /// the first float grid.
 ///
 /// # Errors
 /// If the file has no float grid.
 pub fn density_grid<S: Source>(file: &File<S>) -> Result<usize, SelectError> {
-    let is_number = |grid: &GridInfo| {
-        matches!(grid.value_type(), "float" | "half" | "double") && grid.shape() == Some(Shape::STANDARD)
-    };
     let first = |wanted: &dyn Fn(&GridInfo) -> bool| {
-        file.grids.iter().position(|grid| is_number(grid) && wanted(grid))
+        file.grids.iter().position(|grid| is_drawable(grid) && wanted(grid))
     };
     first(&|grid| grid.name == "density")
         .or_else(|| first(&|grid| grid.grid_class() == "fog volume"))

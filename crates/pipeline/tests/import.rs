@@ -470,7 +470,7 @@ fn a_background_over_a_huge_box_is_refused_at_once() {
 /// that background is all there is around them.
 fn background_box(min: i32, size: i32) -> Grid {
     let mut grid = committed("background_nonzero", "background_5");
-    let mut tree = Tree::empty(5.0, Shape::STANDARD);
+    let mut tree = Tree::empty(5.0_f32, Shape::STANDARD);
     for corner in [min, min + size - 1] {
         let mut mask = [0; 8];
         let offset = leaf_offset([corner; 3]);

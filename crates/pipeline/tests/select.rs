@@ -1,6 +1,6 @@
 //! Which grid is meant, on files with several grids, namesakes and none.
 
-use nuage_pipeline::select::{SelectError, density_grid, named_grid, namesakes};
+use nuage_pipeline::select::{SelectError, density_grid, is_drawable, named_grid, namesakes};
 use nuage_testkit as testkit;
 use nuage_vdb::File;
 
@@ -53,7 +53,7 @@ fn without_a_name_density_is_drawn_else_a_fog_else_a_level_set_else_any_float_gr
 fn a_namesake_that_cannot_be_drawn_does_not_hide_one_that_can() {
     let Some(mut file) = open("data/edge/types_bloscmask.vdb") else { return };
     file.grids.retain(|grid| grid.name == "bool" || grid.name == "float");
-    file.grids.sort_by_key(|grid| grid.is_readable());
+    file.grids.sort_by_key(is_drawable);
     for (number, grid) in file.grids.iter_mut().enumerate() {
         grid.name = "density".to_owned();
         grid.unique_name = format!("density[{number}]");
@@ -77,8 +77,8 @@ fn the_choice_is_the_best_there_is_in_every_file_with_truth() {
         match density_grid(&file) {
             Ok(index) => {
                 let grid = &file.grids[index];
-                assert!(drawable && grid.is_readable(), "{}: {}", path.display(), grid.unique_name);
-                let best = file.grids.iter().filter(|g| g.is_readable()).map(rank).min();
+                assert!(drawable && is_drawable(grid), "{}: {}", path.display(), grid.unique_name);
+                let best = file.grids.iter().filter(|g| is_drawable(g)).map(rank).min();
                 assert_eq!(Some(rank(grid)), best, "{}: {}", path.display(), grid.unique_name);
                 chosen += 1;
             }

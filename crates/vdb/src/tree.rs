@@ -178,10 +178,12 @@ impl<V: Value> Tiles<V> {
     pub(crate) fn pack(values: &[V], child_mask: &Mask, background: V) -> Self {
         let mut tiles = (0..values.len()).filter(|slot| !child_mask.contains(*slot)).map(|slot| values[slot]);
         let Some(first) = tiles.next() else { return Tiles::Uniform(background) };
-        match tiles.all(|value| value.same_bits(first)) {
-            true => Tiles::Uniform(first),
-            false => Tiles::PerSlot(values.into()),
+        if tiles.all(|value| value.same_bits(first)) {
+            return Tiles::Uniform(first);
         }
+        // Trees that say the same shall be equal.
+        let tile = |slot: usize| if child_mask.contains(slot) { background } else { values[slot] };
+        Tiles::PerSlot((0..values.len()).map(tile).collect())
     }
 }
 

@@ -33,6 +33,8 @@ pub(crate) struct Scratch {
     /// A Blosc block before its shuffle is undone.
     shuffled: Vec<u8>,
     inflate: Option<flate2::Decompress>,
+    /// What a zlib stream gives, with room behind it.
+    inflated: Vec<u8>,
     zstd: Option<ruzstd::decoding::FrameDecoder>,
 }
 

@@ -10,16 +10,25 @@ use super::{CodecError, EncodeScratch, Scratch};
 /// OpenVDB's own level, and zlib's default.
 const LEVEL: u32 = 6;
 
+/// The fast loop of the inflater ends where less room than this is left. Values are a few kilobytes: without that room
+/// behind them, a good part of each block would go through the slow loop.
+const FAST_LOOP_BYTES: usize = 320;
+
 /// Inflates the zlib stream at the start of `data` into `out`. Bytes after the stream's end are ignored, as
 /// zlib's own one-call function does.
 ///
 /// # Errors
 /// `Malformed` if the stream is damaged, fails its checksum, or gives fewer or more bytes than `out` holds.
 pub(crate) fn decompress(data: &[u8], out: &mut [u8], scratch: &mut Scratch) -> Result<(), CodecError> {
-    let inflate = scratch.inflate.get_or_insert_with(|| Decompress::new(true));
+    let Scratch { inflate, inflated, .. } = scratch;
+    let inflate = inflate.get_or_insert_with(|| Decompress::new(true));
     inflate.reset(true);
-    match inflate.decompress(data, out, FlushDecompress::Finish) {
-        Ok(Status::StreamEnd) if inflate.total_out() == out.len() as u64 => Ok(()),
+    inflated.resize(out.len() + FAST_LOOP_BYTES, 0);
+    match inflate.decompress(data, inflated, FlushDecompress::Finish) {
+        Ok(Status::StreamEnd) if inflate.total_out() == out.len() as u64 => {
+            out.copy_from_slice(&inflated[..out.len()]);
+            Ok(())
+        }
         Ok(_) => {
             Err(CodecError::Malformed("a zlib stream that does not give the size its block should have"))
         }
