@@ -19,10 +19,10 @@ use crate::text::{number, one_line, thousands};
 /// Say what differs between two files, VDB or NanoVDB: grids, types, transforms, metadata, voxels.
 ///
 /// Grids are paired by name. Voxels are compared as look-ups see them: a tile equals voxels of the same value. Values
-/// of different types are compared as numbers. Mean, RMS and PSNR are taken over voxels that are active in A or B;
-/// PSNR is 10·log10(peak²/MSE), its peak the largest absolute active value of A. Lines marked (note) do not count: how
-/// values are saved, the kind of a transform that does the same, and metadata that writers note anew (file_*).
-/// Exit codes: 0 equal, 1 different or not readable.
+/// of different types are compared as numbers. Mean, RMS and PSNR are taken over the voxels of A that differ from its
+/// background; PSNR is 10·log10(peak²/MSE), the peak their largest absolute value. The largest error is that over all
+/// voxels. Lines marked (note) do not count: how values are saved, the kind of a transform that does the same, and
+/// metadata that writers note anew (file_*). Exit codes: 0 equal, 1 different or not readable.
 #[derive(clap::Args)]
 pub(crate) struct Args {
     /// The first file

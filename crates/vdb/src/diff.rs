@@ -60,8 +60,9 @@ pub struct GridDifference {
 
 /// How the voxels of two grids differ, over all regions that at least one of them stores.
 ///
-/// Of each count, tiles make up as many voxels as they fill. Means are taken over the voxels that are active on at
-/// least one side.
+/// Of each count, tiles make up as many voxels as they fill. Means are taken over the voxels of the first side, the
+/// source, that differ from its background; with [`Options::active_only`], of those over the voxels that are active on
+/// a side.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct VoxelDifference {
     /// Voxels that are active on at least one side.
@@ -78,13 +79,13 @@ pub struct VoxelDifference {
     pub max_error: f64,
     /// Where it is met first; of a tile, its smallest coordinate. `None` if all values are equal.
     pub max_error_at: Option<[i32; 3]>,
-    /// The sum of all finite distances.
+    /// The sum of all finite distances over the voxels that means are taken of.
     pub sum_of_errors: f64,
     /// The sum of their squares.
     pub sum_of_squares: f64,
     /// How many distances these are sums of: one per voxel, or three for vectors.
     pub compared: u64,
-    /// The largest finite absolute value of an active voxel on the first side.
+    /// The largest finite absolute value of the voxels of the first side that means are taken of.
     pub peak: f64,
     /// Nodes and leaves of the first side where the other has a tile or nothing.
     pub nodes_only_in_a: u64,

@@ -1,3 +1,5 @@
+//! Comparing trees quickly against comparing them one voxel after the other.
+
 use proptest::prelude::*;
 
 use super::*;
@@ -42,11 +44,10 @@ fn compare_slowly(a: &Tree<f32>, b: &Tree<f32>) -> VoxelDifference {
                 found.differing_inactive_values += u64::from(!active && error > 0.0);
                 found.differing_states += u64::from(p.active != q.active);
                 found.max_error = found.max_error.max(error);
-                if active {
+                if p.value != a.background {
+                    found.compared += 1;
                     found.sum_of_errors += error;
                     found.sum_of_squares += error * error;
-                }
-                if p.active {
                     found.peak = found.peak.max(f64::from(p.value.abs()));
                 }
             }

@@ -93,9 +93,10 @@ impl<V: Value> Walk<'_, V> {
             return;
         }
         count_nodes(&task, &mut self.total);
+        let background = self.a.background;
         self.children(&task, &mut |walk, child| {
             // Most slots of most nodes are the same on both sides.
-            if !is_same_tile(&child) {
+            if !is_background(&child, background) {
                 walk.plan(child);
             }
         });
@@ -140,10 +141,10 @@ fn for_children<V: Value>(a: &Tree<V>, b: &Tree<V>, task: &Task<V>, each: &mut d
     }
 }
 
-/// Whether there is nothing to say of a region: inactive and the same on both sides.
-fn is_same_tile<V: Value>(task: &Task<V>) -> bool {
+/// Whether there is nothing to say of a region: inactive, and the background of the first side on both.
+fn is_background<V: Value>(task: &Task<V>, background: V) -> bool {
     match (task.a, task.b) {
-        (Part::Tile(a, false), Part::Tile(b, false)) => a.same_bits(b),
+        (Part::Tile(a, false), Part::Tile(b, false)) => a.same_bits(b) && a.same_bits(background),
         _ => false,
     }
 }
@@ -166,12 +167,13 @@ fn compare_region<V: Value>(
     let shape = a.shape;
     if let (Part::Tile(x, x_on), Part::Tile(y, y_on)) = (task.a, task.b) {
         let log2: u32 = shape.log2_root_to_leaf()[task.level..].iter().map(|log2| u32::from(*log2)).sum();
-        return compare_values([x, y], [x_on, y_on], 1 << (3 * log2).min(63), task.origin, options, found);
+        let voxels = 1 << (3 * log2).min(63);
+        return compare_values([x, y], [x_on, y_on], a.background, voxels, task.origin, options, found);
     }
     count_nodes(task, found);
     if task.level < shape.inner_levels() {
         for_children(a, b, task, &mut |child| {
-            if !is_same_tile(&child) {
+            if !is_background(&child, a.background) {
                 compare_region(a, b, options, &child, found);
             }
         });
@@ -188,7 +190,7 @@ fn compare_region<V: Value>(
         let (y, y_on) = voxel(b, task.b, offset);
         let local = [2, 1, 0].map(|axis| (offset >> (log2 * axis)) as i32 & edge_mask);
         let ijk = std::array::from_fn(|axis| task.origin[axis].wrapping_add(local[axis]));
-        compare_values([x, y], [x_on, y_on], 1, ijk, options, found);
+        compare_values([x, y], [x_on, y_on], a.background, 1, ijk, options, found);
     }
 }
 
@@ -196,13 +198,15 @@ fn compare_region<V: Value>(
 fn compare_values<V: Value>(
     [x, y]: [V; 2],
     [x_on, y_on]: [bool; 2],
+    x_background: V,
     voxels: u64,
     ijk: [i32; 3],
     options: &Options,
     found: &mut VoxelDifference,
 ) {
     let active = x_on || y_on;
-    if !active && (options.active_only || x.same_bits(y)) {
+    let is_stored = !x.same_bits(x_background);
+    if !active && (options.active_only || (x.same_bits(y) && !is_stored)) {
         return;
     }
     let add_to = |count: &mut u64| *count = count.saturating_add(voxels);
@@ -228,19 +232,19 @@ fn compare_values<V: Value>(
         found.max_error = largest;
         found.max_error_at = Some(ijk);
     }
-    if !active {
+    if active {
+        add_to(&mut found.active);
+    }
+    if !is_stored {
         return;
     }
-    add_to(&mut found.active);
     if largest.is_finite() {
         found.compared = found.compared.saturating_add(voxels.saturating_mul(V::COMPONENTS as u64));
         found.sum_of_errors += sum * voxels as f64;
         found.sum_of_squares += squares * voxels as f64;
     }
-    if x_on {
-        let sizes = (0..V::COMPONENTS).map(|i| x.component(i).abs()).filter(|size| size.is_finite());
-        found.peak = sizes.fold(found.peak, f64::max);
-    }
+    let sizes = (0..V::COMPONENTS).map(|i| x.component(i).abs()).filter(|size| size.is_finite());
+    found.peak = sizes.fold(found.peak, f64::max);
 }
 
 /// Adds what was found in a later region.
