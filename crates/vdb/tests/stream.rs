@@ -48,7 +48,7 @@ fn a_stream_holds_the_same_grids_as_a_file() {
         }
         several += usize::from(file.grids.len() > 1);
     }
-    assert!(several >= 8 && read >= 100, "{several} {read}");
+    assert!(several >= 12 && read >= 70, "{several} {read}");
 }
 
 #[test]
