@@ -3,8 +3,9 @@
 #
 #   bench/read_vs_openvdb.sh [FILE.vdb ...]
 #
-# Without files, reads the default list below ${NUAGE_DATA:-../shared}/data. ROUNDS (3) rounds of REPEATS (7) reads
-# each, the three readers taking turns. See README.md beside this file for how to read what it prints.
+# Without files, reads the default list below ${NUAGE_DATA:-../shared}/data, and two of those files saved again by
+# OpenVDB with each compression in full and half width. ROUNDS (3) rounds of REPEATS (7) reads each, the three readers
+# taking turns. See README.md beside this file for how to read what it prints.
 set -euo pipefail
 
 cd_from=$PWD
@@ -58,6 +59,10 @@ if [ ! "$out/openvdb_read" -nt "$root/bench/openvdb_read.cc" ]; then
   require_openvdb
   g++ -std=c++17 -O2 "$root/bench/openvdb_read.cc" -o "$out/openvdb_read" -lopenvdb -ltbb -lImath
 fi
+if [ ! "$out/openvdb_resave" -nt "$root/bench/openvdb_resave.cc" ]; then
+  require_openvdb
+  g++ -std=c++17 -O2 "$root/bench/openvdb_resave.cc" -o "$out/openvdb_resave" -lopenvdb -ltbb -lImath
+fi
 if [ -z "${NUAGE_READ_TIME:-}" ]; then
   (cd "$root" && cargo build --quiet --release -p nuage-vdb --example read_time)
   target=${CARGO_TARGET_DIR:-target}
@@ -72,6 +77,16 @@ if [ $# -gt 0 ]; then
   done
 else
   for name in "${default_files[@]}"; do files+=("$data/$name.vdb"); done
+  mkdir -p "$out/kinds"
+  for name in cumulus_half_f16_blosc dragon_ls1000_f16_blosc; do
+    for codec in blosc zip none; do
+      for width in full half; do
+        saved=$out/kinds/${name%%_*}_${codec}_$width.vdb
+        [ -f "$saved" ] || "$out/openvdb_resave" "$data/static/$name.vdb" "$saved" "$codec" "$width"
+        files+=("$saved")
+      done
+    done
+  done
 fi
 
 cpu=$(sed -n 's/^model name[^:]*: *//p' /proc/cpuinfo 2>/dev/null | head -n 1)

@@ -6,6 +6,7 @@
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 
+use nuage_vdb::points::AttributeSet;
 use nuage_vdb::{AnyFile, AnyTree, File, Histogram, Source, Statistics, nano};
 use serde_json::Value;
 
@@ -66,8 +67,20 @@ pub(crate) struct Decoded {
     pub(crate) statistics: Statistics,
     /// Memory that the tree took, in bytes.
     pub(crate) memory_bytes: u64,
+    /// If the grid is one of points.
+    pub(crate) points: Option<Points>,
     /// If asked for.
     pub(crate) hashes: Option<Hashes>,
+}
+
+/// What is known of a grid's points.
+pub(crate) struct Points {
+    /// How many there are.
+    pub(crate) count: u64,
+    /// The attributes and groups of the first leaf, which almost always are those of all.
+    pub(crate) set: AttributeSet,
+    /// How many different sets there are.
+    pub(crate) set_count: usize,
 }
 
 /// 64-bit FNV-1a hashes of a tree.
@@ -201,6 +214,14 @@ fn decoded(tree: &AnyTree, with_hashes: bool) -> Decoded {
         background: tree.background(),
         histograms: finite.map(|(i, range)| tree.histogram(i, *range, HISTOGRAM_INTERVALS)).collect(),
         memory_bytes: tree.memory_bytes(),
+        points: match tree {
+            AnyTree::Points(points) => points.attribute_sets.first().map(|set| Points {
+                count: points.point_count(),
+                set: set.clone(),
+                set_count: points.attribute_sets.len(),
+            }),
+            _ => None,
+        },
         hashes: with_hashes
             .then(|| Hashes { topology: tree.topology_hash(), leaf_values: tree.leaf_value_hash() }),
         statistics,

@@ -6,6 +6,7 @@
 
 use std::path::Path;
 
+use nuage_vdb::points::Attribute;
 use nuage_vdb::{
     ComponentStatistics, File, GridInfo, Histogram, IndexBox, MetaValue, Metadata, TileCount, Transform,
     Voxel, format_g, nano,
@@ -111,6 +112,15 @@ fn with_contents(
     grid["histogram"] = json!(decoded.map(|d| histograms(&d.histograms)));
     grid["memory_bytes"] = json!(decoded.map(|d| d.memory_bytes));
     grid["nan_count"] = json!(stats.map(|s| s.nan_count));
+    if let Some(points) = decoded.and_then(|decoded| decoded.points.as_ref()) {
+        let attribute = |a: &Attribute| {
+            let [name, value_type, codec] = [&a.name, &a.value_type, &a.codec].map(|t| text(t.as_bytes()));
+            json!({ "name": name, "type": value_type, "codec": codec })
+        };
+        grid["point_count"] = json!(points.count);
+        grid["attributes"] = points.set.attributes.iter().map(attribute).collect();
+        grid["groups"] = points.set.groups.iter().map(|group| text(group.name.as_bytes())).collect();
+    }
     if with_hashes {
         let hashes = decoded.and_then(|decoded| decoded.hashes.as_ref());
         let hex = |hash: u64| format!("{hash:016x}");

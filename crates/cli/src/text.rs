@@ -3,9 +3,10 @@
 use std::io::{self, Write};
 use std::path::Path;
 
+use nuage_vdb::points::Attribute;
 use nuage_vdb::{File, GridInfo, IndexBox, Map, Metadata, Shape, Statistics, Transform, format_g, nano};
 
-use crate::info::{Contents, Decoded};
+use crate::info::{Contents, Decoded, Points};
 
 /// Where the second column begins.
 const LABEL_WIDTH: usize = 16;
@@ -61,7 +62,27 @@ pub(crate) fn grid(out: &mut impl Write, info: &GridInfo, contents: &Contents) -
     metadata(out, &info.metadata)
 }
 
+fn points(out: &mut impl Write, points: &Points) -> io::Result<()> {
+    let sets = match points.set_count {
+        1 => String::new(),
+        more => format!(" in {more} different sets, of which this is the first"),
+    };
+    row(out, "points", thousands(points.count))?;
+    row(out, "attributes", format!("{}{sets}", thousands(points.set.attributes.len() as u64)))?;
+    for Attribute { name, value_type, codec } in &points.set.attributes {
+        writeln!(out, "    {}: {} ({})", one_line(name), one_line(value_type), one_line(codec))?;
+    }
+    if !points.set.groups.is_empty() {
+        let names: Vec<String> = points.set.groups.iter().map(|group| one_line(&group.name)).collect();
+        row(out, "groups", names.join(", "))?;
+    }
+    Ok(())
+}
+
 fn values(out: &mut impl Write, shape: Option<Shape>, decoded: &Decoded) -> io::Result<()> {
+    if let Some(found) = &decoded.points {
+        points(out, found)?;
+    }
     let stats = &decoded.statistics;
     row(out, "background", vector_or_number(&decoded.background))?;
     match stats.min_max() {

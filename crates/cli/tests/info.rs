@@ -136,6 +136,11 @@ fn compare_grid(got: &Value, want: &Value, context: &str) {
             assert_eq!(got["nan_count"], 0, "{context}");
         }
     }
+    if want.get("point_count").is_some() {
+        equal("point_count");
+        let attributes = got["attributes"].as_array().unwrap();
+        assert!(attributes.iter().any(|a| a["name"] == "P" && a["type"] == "vec3s"), "{context}");
+    }
     equal("fnv1a64_topology");
     // A NaN has many bit patterns, and not every writer keeps them.
     if want["background"] != "nan" && want["nan_count"].as_u64().unwrap_or(0) == 0 {

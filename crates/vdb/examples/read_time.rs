@@ -8,7 +8,6 @@
 use std::borrow::Cow;
 use std::error::Error;
 use std::io;
-use std::os::unix::fs::FileExt;
 use std::time::Instant;
 
 use nuage_vdb::{File, Grid, Source};
@@ -23,9 +22,24 @@ impl Source for Disk {
 
     fn range(&self, offset: u64, len: usize) -> io::Result<Cow<'_, [u8]>> {
         let mut bytes = vec![0; len];
-        self.0.read_exact_at(&mut bytes, offset)?;
+        read_exact_at(&self.0, &mut bytes, offset)?;
         Ok(Cow::Owned(bytes))
     }
+}
+
+#[cfg(unix)]
+fn read_exact_at(file: &std::fs::File, bytes: &mut [u8], offset: u64) -> io::Result<()> {
+    std::os::unix::fs::FileExt::read_exact_at(file, bytes, offset)
+}
+
+#[cfg(not(unix))]
+fn read_exact_at(mut file: &std::fs::File, bytes: &mut [u8], offset: u64) -> io::Result<()> {
+    use std::io::{Read, Seek};
+    // Two threads must not move the place of one another.
+    static TURN: std::sync::Mutex<()> = std::sync::Mutex::new(());
+    let _turn = TURN.lock().map_err(|_| io::Error::other("another reader failed"))?;
+    file.seek(io::SeekFrom::Start(offset))?;
+    file.read_exact(bytes)
 }
 
 fn read_all_grids(path: &str) -> Result<Vec<Grid>, Box<dyn Error>> {

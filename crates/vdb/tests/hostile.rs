@@ -24,6 +24,7 @@ fn bad_files_end_in_errors_within_the_limits() {
     // From the smaller limits to the larger, since the allocator knows only the highest peak of all.
     small_limits_are_kept_and_named();
     with_limit(64 * MIB, every_truncation_is_an_error);
+    with_limit(64 * MIB, prefixes_of_all_files_are_errors);
     with_limit(64 * MIB, random_damage_is_an_error_or_a_grid);
     with_limit(64 * MIB, extreme_values_in_headers_are_errors_or_grids);
     with_limit(64 * MIB, the_collected_bad_files_end_soon);
@@ -123,6 +124,34 @@ fn every_truncation_is_an_error(limits: Limits) {
             }
         }
     }
+}
+
+fn prefixes_of_all_files_are_errors(limits: Limits) {
+    let folder = std::fs::read_dir(testkit::committed("data/edge")).unwrap();
+    let paths = folder.map(|entry| entry.unwrap().path());
+    let mut files = 0;
+    for path in paths.filter(|path| path.extension().is_some_and(|extension| extension == "vdb")) {
+        let bytes = std::fs::read(&path).unwrap();
+        let stream = surgery::as_stream(&bytes);
+        for whole in [&bytes, &stream] {
+            let started = Instant::now();
+            // The beginning in full, the rest here and there.
+            let step = 1 + whole.len() / 40;
+            for len in
+                (0..whole.len().min(130)).chain((130..whole.len()).step_by(step)).chain([whole.len() - 1])
+            {
+                let result = read_all(&whole[..len], limits);
+                assert!(
+                    matches!(result, Err(Error::Malformed { .. })),
+                    "{}: {len}: {result:?}",
+                    path.display()
+                );
+            }
+            assert!(started.elapsed() < Duration::from_secs(20), "{}", path.display());
+        }
+        files += 1;
+    }
+    assert!(files >= 40, "only {files} files");
 }
 
 fn random_damage_is_an_error_or_a_grid(limits: Limits) {
