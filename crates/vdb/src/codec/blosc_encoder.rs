@@ -4,8 +4,10 @@
 //! Chunks differ from those of OpenVDB in one thing: their elements are the numbers that the values consist
 //! of, not always four bytes. Halves and doubles compress better that way, and every decoder reads it.
 
+use lz4_flex::block;
+
 use super::blosc::{HEADER_BYTES, MAX_SPLIT_TYPESIZE, MIN_SPLIT_BYTES};
-use super::{EncodeScratch, lz4, shuffle};
+use super::{EncodeScratch, shuffle};
 
 const FORMAT_VERSION: u8 = 2;
 const LZ4_STREAM_VERSION: u8 = 1;
@@ -63,7 +65,7 @@ fn append(
     let starts_at = out.len();
     // Of nothing there is a block too.
     out.resize(starts_at + 4 * blocks.len().max(1), 0);
-    let EncodeScratch { shuffled, lz4: table, .. } = scratch;
+    let EncodeScratch { shuffled, .. } = scratch;
     for (i, block) in blocks.enumerate() {
         let start = (out.len() - begin) as u32;
         out[starts_at + 4 * i..][..4].copy_from_slice(&start.to_le_bytes());
@@ -74,11 +76,7 @@ fn append(
         for stream in shuffled.chunks_exact((block.len() / streams).max(1)) {
             let size_at = out.len();
             out.extend_from_slice(&[0; 4]);
-            if !lz4::compress(stream, stream.len(), table, out) {
-                // As large as what it stands for: the stream itself.
-                out.truncate(size_at + 4);
-                out.extend_from_slice(stream);
-            }
+            append_stream(stream, out);
             let stream_bytes = (out.len() - size_at - 4) as u32;
             out[size_at..size_at + 4].copy_from_slice(&stream_bytes.to_le_bytes());
             if out.len() - begin >= data.len() {
@@ -89,6 +87,20 @@ fn append(
     let chunk_bytes = (out.len() - begin) as u32;
     out[begin + 12..begin + 16].copy_from_slice(&chunk_bytes.to_le_bytes());
     (out.len() - begin < data.len()).then_some(())
+}
+
+/// Appends a stream as an LZ4 block, or as it is if that is not smaller: a stream as large as what it stands for is
+/// taken for that.
+fn append_stream(stream: &[u8], out: &mut Vec<u8>) {
+    let begin = out.len();
+    out.resize(begin + block::get_maximum_output_size(stream.len()), 0);
+    match block::compress_into(stream, &mut out[begin..]) {
+        Ok(size) if size < stream.len() => out.truncate(begin + size),
+        _ => {
+            out.truncate(begin);
+            out.extend_from_slice(stream);
+        }
+    }
 }
 
 #[cfg(test)]

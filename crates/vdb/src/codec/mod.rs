@@ -11,7 +11,6 @@
 pub(crate) mod blosc;
 pub(crate) mod blosc_encoder;
 mod blosclz;
-mod lz4;
 mod shuffle;
 pub(crate) mod zlib;
 
@@ -44,6 +43,5 @@ pub(crate) struct Scratch {
 pub(crate) struct EncodeScratch {
     /// A Blosc block after its shuffle.
     shuffled: Vec<u8>,
-    lz4: lz4::Table,
     deflate: Option<flate2::Compress>,
 }
