@@ -14,7 +14,6 @@ data=${NUAGE_DATA:-$root/../shared}/data
 rounds=${ROUNDS:-3}
 repeats=${REPEATS:-7}
 out=$root/out/bench
-packages=(libopenvdb-dev libtbb-dev libboost-dev) # libopenvdb-dev's headers use Boost's but do not pull them in.
 
 default_files=(
   static/cumulus_half_f16_blosc
@@ -25,56 +24,15 @@ default_files=(
   sequences/explosion/fluid_data_0030
 )
 
-fail() {
-  echo "read_vs_openvdb: $*" >&2
-  exit 1
-}
-
-# Installs OpenVDB's headers from Debian if they are absent and this user may; otherwise says how.
-require_openvdb() {
-  local probe='#include <openvdb/openvdb.h>'
-  echo "$probe" | g++ -std=c++17 -x c++ -fsyntax-only - 2>/dev/null && return
-  if [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null; then
-    echo "OpenVDB's headers are absent; running: apt-get install ${packages[*]}" >&2
-    apt-get install -y --no-install-recommends "${packages[@]}" >/dev/null || true
-  fi
-  echo "$probe" | g++ -std=c++17 -x c++ -fsyntax-only - 2>/dev/null ||
-    fail "no OpenVDB headers; install them as root with: apt-get install ${packages[*]}"
-}
-
-# The value of key $1 in a reader's line $2.
-field() { sed -n "s/.*\b$1=\([0-9.]*\).*/\1/p" <<<"$2"; }
-
-# The median of the arguments.
-median() {
-  printf '%s\n' "$@" | sort -g |
-    awk '{ v[NR] = $1 } END { m = int((NR + 1) / 2); print NR % 2 ? v[m] : (v[m] + v[m + 1]) / 2 }'
-}
-
-ratio() { awk -v a="$1" -v b="$2" 'BEGIN { printf "%.2f", a / b }'; }
-
-command -v g++ >/dev/null || fail "no g++"
-mkdir -p "$out"
-if [ ! "$out/openvdb_read" -nt "$root/bench/openvdb_read.cc" ]; then
-  require_openvdb
-  g++ -std=c++17 -O2 "$root/bench/openvdb_read.cc" -o "$out/openvdb_read" -lopenvdb -ltbb -lImath
-fi
-if [ ! "$out/openvdb_resave" -nt "$root/bench/openvdb_resave.cc" ]; then
-  require_openvdb
-  g++ -std=c++17 -O2 "$root/bench/openvdb_resave.cc" -o "$out/openvdb_resave" -lopenvdb -ltbb -lImath
-fi
-if [ -z "${NUAGE_READ_TIME:-}" ]; then
-  (cd "$root" && cargo build --quiet --release -p nuage-vdb --example read_time)
-  target=${CARGO_TARGET_DIR:-target}
-  case $target in /*) ;; *) target=$root/$target ;; esac
-  NUAGE_READ_TIME=$target/release/examples/read_time
-fi
+# shellcheck source=common.sh
+source "$root/bench/common.sh"
+build_peer openvdb_read
+build_peer openvdb_resave
+[ -n "${NUAGE_READ_TIME:-}" ] || NUAGE_READ_TIME=$(build_example read_time)
 
 files=()
 if [ $# -gt 0 ]; then
-  for file in "$@"; do
-    case $file in /*) files+=("$file") ;; *) files+=("$cd_from/$file") ;; esac
-  done
+  mapfile -t files < <(absolute "$@")
 else
   for name in "${default_files[@]}"; do files+=("$data/$name.vdb"); done
   mkdir -p "$out/kinds"

@@ -113,13 +113,13 @@ impl<S: Source> File<S> {
                 return Err(Error::malformed(reader.offset(), "a grid's header passes its end"));
             }
             if header.file_version < header::INSTANCES_SINCE {
-                let format = block_format(&header, &info);
+                let format = block_format(header.file_version, &info);
                 info.transform = transform_behind_topology(&source, &info, format, grid_end, &limits)?;
             }
             info.tree_range[1] = grid_end;
             if !header.has_offsets {
                 if info.instance_of.is_none() {
-                    skip_tree(&mut reader, &info, block_format(&header, &info), &limits)?;
+                    skip_tree(&mut reader, &info, block_format(header.file_version, &info), &limits)?;
                 }
                 info.tree_range[1] = reader.offset();
             }
@@ -224,11 +224,7 @@ impl<S: Source> File<S> {
         let shape = info.shape().ok_or_else(unsupported)?;
         let mut budget = Budget::new(&self.limits);
         let mut reader = Reader::new(&self.source, info.tree_range[0], info.tree_range[1])?;
-        let format = BlockFormat {
-            compression: info.compression,
-            half: info.save_float_as_half,
-            file_version: self.file_version,
-        };
+        let format = block_format(self.file_version, info);
         let read = TreeRead { source: &self.source, format, shape };
         for_value_type!(
             info.stored_type(),
@@ -257,10 +253,7 @@ impl TreeRead<'_> {
         bbox: Option<IndexBox>,
         budget: &mut Budget,
     ) -> Result<Tree<V>> {
-        let mut tree = read::topology::<V>(reader, self.format, self.shape, budget)?;
-        if self.format.file_version < header::INSTANCES_SINCE {
-            Transform::read(reader, self.format.file_version)?;
-        }
+        let mut tree = nodes::<V>(reader, self.format, self.shape, budget)?;
         let Some(bbox) = bbox else {
             read::leaf_values(self.source, reader, self.format, &mut tree, budget)?;
             return Ok(tree);
@@ -284,12 +277,22 @@ fn grid_of(info: &GridInfo, tree: Arc<AnyTree>) -> Grid {
     }
 }
 
-fn block_format(header: &Header, info: &GridInfo) -> BlockFormat {
-    BlockFormat {
-        compression: info.compression,
-        half: info.save_float_as_half,
-        file_version: header.file_version,
+fn block_format(file_version: u32, info: &GridInfo) -> BlockFormat {
+    BlockFormat { compression: info.compression, half: info.save_float_as_half, file_version }
+}
+
+/// Reads the nodes of a tree and moves to its leaves' values: past the transform, which old files have in between.
+fn nodes<V: Value>(
+    reader: &mut Reader<'_>,
+    format: BlockFormat,
+    shape: Shape,
+    budget: &mut Budget,
+) -> Result<Tree<V>> {
+    let tree = read::topology::<V>(reader, format, shape, budget)?;
+    if format.file_version < header::INSTANCES_SINCE {
+        Transform::read(reader, format.file_version)?;
     }
+    Ok(tree)
 }
 
 fn no_way_past(info: &GridInfo) -> Error {
@@ -303,10 +306,7 @@ fn skip_tree(reader: &mut Reader<'_>, info: &GridInfo, format: BlockFormat, limi
     for_value_type!(
         info.stored_type(),
         V => {
-            let tree = read::topology::<V>(reader, format, shape, &mut budget)?;
-            if format.file_version < header::INSTANCES_SINCE {
-                Transform::read(reader, format.file_version)?;
-            }
+            let tree = nodes::<V>(reader, format, shape, &mut budget)?;
             read::skip_leaf_values(reader, format, &tree.leaves)
         },
         match info.stored_type() {
@@ -330,18 +330,11 @@ pub(crate) fn walk_tree<S: Source>(file: &File<S>, info: &GridInfo) -> Result<Op
     let shape = info.shape().ok_or_else(|| no_way_past(info))?;
     let mut reader = Reader::new(&file.source, info.tree_range[0], info.tree_range[1])?;
     let mut budget = Budget::new(&file.limits);
-    let format = BlockFormat {
-        compression: info.compression,
-        half: info.save_float_as_half,
-        file_version: file.file_version,
-    };
+    let format = block_format(file.file_version, info);
     for_value_type!(
         info.stored_type(),
         V => {
-            let tree = read::topology::<V>(&mut reader, format, shape, &mut budget)?;
-            if format.file_version < header::INSTANCES_SINCE {
-                Transform::read(&mut reader, format.file_version)?;
-            }
+            let tree = nodes::<V>(&mut reader, format, shape, &mut budget)?;
             let contrary_mask = read::first_contrary_mask(&mut reader, format, &tree.leaves)?;
             Ok(Some(Walked { end: reader.offset(), contrary_mask }))
         },

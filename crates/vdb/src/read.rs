@@ -99,8 +99,7 @@ pub(crate) fn leaf_values<V: Value>(
     budget: &mut Budget,
 ) -> Result<()> {
     let spans = locate_leaves::<V>(reader, format, &tree.leaves, None, budget)?;
-    let all: Vec<u32> = Vec::new();
-    tree.leaves.values = decode_leaves(source, format, tree, &all, &spans, budget)?;
+    tree.leaves.values = decode_leaves(source, format, tree, &[], &spans, budget)?;
     Ok(())
 }
 
