@@ -1,11 +1,13 @@
 //! Reading a tree: first its topology, then its values.
 //!
 //! A tree is written depth first, all nodes before all leaf values. The topology is read in one pass and the value
-//! blocks of the leaves are located in a second one; with that, leaves decode independently and in parallel (feature
+//! blocks of the leaves are located in a second one; from there, leaves decode independently and in parallel (feature
 //! `parallel`), and those outside of a box that is asked for are passed over.
 //!
 //! What older files do otherwise stands at the places where they do it: before version 214 inner nodes interleave
 //! values and children, before 222 they store the values of tiles alone and leaves repeat their origin.
+
+use std::sync::{Mutex, PoisonError};
 
 use crate::block::{self, BlockFormat, DecodeScratch};
 use crate::error::{Error, Result};
@@ -98,8 +100,7 @@ pub(crate) fn leaf_values<V: Value>(
     tree: &mut Tree<V>,
     budget: &mut Budget,
 ) -> Result<()> {
-    let spans = locate_leaves::<V>(reader, format, &tree.leaves, None, budget)?;
-    tree.leaves.values = decode_leaves(source, format, tree, &[], &spans, budget)?;
+    tree.leaves.values = decode_leaves(source, reader, format, tree, None, budget)?;
     Ok(())
 }
 
@@ -120,8 +121,7 @@ pub(crate) fn leaf_values_in_box<V: Value>(
     budget.take(count, 4, "leaves")?;
     let origins = tree.leaves.origins.iter().enumerate();
     let wanted: Vec<u32> = origins.filter(|(_, o)| touches(o)).map(|(i, _)| i as u32).collect();
-    let spans = locate_leaves::<V>(reader, format, &tree.leaves, Some(&wanted), budget)?;
-    let values = decode_leaves(source, format, tree, &wanted, &spans, budget)?;
+    let values = decode_leaves(source, reader, format, tree, Some(&wanted), budget)?;
     Ok((wanted, values))
 }
 
@@ -272,30 +272,37 @@ fn root_origin(reader: &mut Reader<'_>, shape: Shape) -> Result<[i32; 3]> {
     }
 }
 
-/// Finds the value blocks of all leaves, or of those that are wanted, in ascending order of their numbers.
-fn locate_leaves<V: Value>(
-    reader: &mut Reader<'_>,
+/// Finds the value blocks of leaves, task by task, in ascending order of their numbers.
+struct Locator<'r, 'a, 't, V: Value> {
+    reader: &'r mut Reader<'a>,
     format: BlockFormat,
-    leaves: &Leaves<V>,
-    wanted: Option<&[u32]>,
-    budget: &mut Budget,
-) -> Result<Vec<Span>> {
-    let count = wanted.map_or(leaves.len(), <[u32]>::len);
-    budget.take(count, size_of::<Span>(), "leaves")?;
-    let mut spans = Vec::with_capacity(count);
-    let mut next = wanted.map(|wanted| wanted.iter().copied().peekable());
-    for i in 0..leaves.len() {
-        // Nothing is left to find. Of a whole grid every leaf is wanted and looked at.
-        if spans.len() == count {
-            break;
+    leaves: &'t Leaves<V>,
+    /// The leaves to find, all of them if `None`.
+    wanted: Option<&'t [u32]>,
+    /// The leaf at which the reader stands.
+    next_leaf: usize,
+}
+
+impl<V: Value> Locator<'_, '_, '_, V> {
+    /// The blocks of a task. Past the last leaf that is wanted nothing is looked at.
+    fn task(&mut self, task: usize) -> Result<Vec<Span>> {
+        let count = self.wanted.map_or(self.leaves.len(), <[u32]>::len);
+        let numbers = task * LEAVES_PER_TASK..count.min((task + 1) * LEAVES_PER_TASK);
+        let mut spans = Vec::with_capacity(numbers.len());
+        for number in numbers {
+            let leaf = self.wanted.map_or(number, |wanted| wanted[number] as usize);
+            while self.next_leaf < leaf {
+                self.skip_leaf()?;
+            }
+            spans.push(self.skip_leaf()?);
         }
-        let span = skip_leaf(reader, format, leaves, i)?;
-        let is_wanted = next.as_mut().is_none_or(|next| next.next_if_eq(&(i as u32)).is_some());
-        if is_wanted {
-            spans.push(span);
-        }
+        Ok(spans)
     }
-    Ok(spans)
+
+    fn skip_leaf(&mut self) -> Result<Span> {
+        self.next_leaf += 1;
+        skip_leaf(self.reader, self.format, self.leaves, self.next_leaf - 1)
+    }
 }
 
 /// Moves past what a file holds of a leaf and says where its values are.
@@ -348,59 +355,108 @@ fn leaf_format<V: Value>(format: BlockFormat) -> BlockFormat {
     }
 }
 
-/// Decodes the leaves whose blocks stand at the given places: all leaves, or those of `wanted` numbers.
+/// Reads the values of all leaves, or of those of `wanted` numbers. The reader stands at the first byte behind the
+/// topology.
+///
+/// Where a block stands is known only once those before it were passed. One thread finds them and hands them out,
+/// while the others decode already.
 fn decode_leaves<V: Value>(
     source: &dyn Source,
+    reader: &mut Reader<'_>,
     format: BlockFormat,
     tree: &Tree<V>,
-    wanted: &[u32],
-    spans: &[Span],
+    wanted: Option<&[u32]>,
     budget: &mut Budget,
 ) -> Result<Vec<V::Stored>> {
+    let count = wanted.map_or(tree.leaves.len(), <[u32]>::len);
     let per_leaf = V::stored_per_leaf(tree.leaves.leaf_voxels);
-    budget.take(spans.len(), per_leaf * size_of::<V::Stored>(), "the values of all leaves")?;
-    let mut values = vec![V::Stored::default(); spans.len() * per_leaf];
+    budget.take(count, size_of::<Span>(), "leaves")?;
+    budget.take(count, per_leaf * size_of::<V::Stored>(), "the values of all leaves")?;
+    let mut values = vec![V::Stored::default(); count * per_leaf];
     if per_leaf == 0 {
+        skip_leaf_values(reader, format, &tree.leaves)?;
         return Ok(values);
     }
-    let decode_some = |task: usize, out: &mut [V::Stored], scratch: &mut DecodeScratch<V>| -> Result<()> {
-        let first = task * LEAVES_PER_TASK;
-        let spans = &spans[first..spans.len().min(first + LEAVES_PER_TASK)];
+    let mut locator = Locator { reader, format, leaves: &tree.leaves, wanted, next_leaf: 0 };
+    let decoder =
+        LeafDecoder { source, format, tree, wanted, idle: Mutex::default(), failure: Mutex::default() };
+    let tasks = values.chunks_mut(LEAVES_PER_TASK * per_leaf).enumerate();
+    #[cfg(feature = "parallel")]
+    rayon::scope(|scope| -> Result<()> {
+        for (task, out) in tasks {
+            let spans = locator.task(task)?;
+            let decoder = &decoder;
+            scope.spawn(move |_| decoder.run(task, &spans, out));
+        }
+        Ok(())
+    })?;
+    #[cfg(not(feature = "parallel"))]
+    for (task, out) in tasks {
+        decoder.run(task, &locator.task(task)?, out);
+    }
+    match decoder.failure.into_inner().unwrap_or_else(PoisonError::into_inner) {
+        Some((_, error)) => Err(error),
+        None => Ok(values),
+    }
+}
+
+/// What the tasks of decoding leaves share.
+struct LeafDecoder<'t, V: Value> {
+    source: &'t dyn Source,
+    format: BlockFormat,
+    tree: &'t Tree<V>,
+    wanted: Option<&'t [u32]>,
+    /// Buffers that no task uses now.
+    idle: Mutex<Vec<DecodeScratch<V>>>,
+    /// The first task that failed, by number and not by time, so that the same file gives the same error.
+    failure: Mutex<Option<(usize, Error)>>,
+}
+
+impl<V: Value> LeafDecoder<'_, V> {
+    /// Decodes the leaves of a task into `out`, unless an earlier one has failed.
+    fn run(&self, task: usize, spans: &[Span], out: &mut [V::Stored]) {
+        let failure = || self.failure.lock().unwrap_or_else(PoisonError::into_inner);
+        let idle = || self.idle.lock().unwrap_or_else(PoisonError::into_inner);
+        if failure().as_ref().is_some_and(|(failed, _)| *failed < task) {
+            return;
+        }
+        let mut scratch = idle().pop().unwrap_or_default();
+        let result = self.decode(task * LEAVES_PER_TASK, spans, out, &mut scratch);
+        idle().push(scratch);
+        if let Err(error) = result {
+            let mut failure = failure();
+            if failure.as_ref().is_none_or(|(failed, _)| task < *failed) {
+                *failure = Some((task, error));
+            }
+        }
+    }
+
+    /// Decodes leaves, of which the first is the `first` of those that are wanted.
+    fn decode(
+        &self,
+        first: usize,
+        spans: &[Span],
+        out: &mut [V::Stored],
+        scratch: &mut DecodeScratch<V>,
+    ) -> Result<()> {
         let (Some(head), Some(tail)) = (spans.first(), spans.last()) else { return Ok(()) };
         let end = tail.begin + u64::from(tail.len);
         let whole = match end - head.begin {
-            span if span <= MAX_TASK_SPAN_BYTES => Some(source.range(head.begin, span as usize)?),
+            span if span <= MAX_TASK_SPAN_BYTES => Some(self.source.range(head.begin, span as usize)?),
             _ => None,
         };
         let mut reader = match &whole {
             Some(bytes) => Reader::over(bytes, head.begin),
-            None => Reader::new(source, head.begin, end)?,
+            None => Reader::new(self.source, head.begin, end)?,
         };
+        let per_leaf = V::stored_per_leaf(self.tree.leaves.leaf_voxels);
         for (i, (out, span)) in out.chunks_mut(per_leaf).zip(spans).enumerate() {
-            let leaf = wanted.get(first + i).map_or(first + i, |leaf| *leaf as usize);
+            let leaf = self.wanted.map_or(first + i, |wanted| wanted[first + i] as usize);
             reader.seek(span.begin);
-            decode_leaf(&mut reader, format, tree, leaf, out, scratch)?;
+            decode_leaf(&mut reader, self.format, self.tree, leaf, out, scratch)?;
         }
         Ok(())
-    };
-    #[cfg(feature = "parallel")]
-    {
-        use rayon::prelude::*;
-        values
-            .par_chunks_mut(LEAVES_PER_TASK * per_leaf)
-            .enumerate()
-            .try_for_each_init(DecodeScratch::default, |scratch, (task, out)| {
-                decode_some(task, out, scratch)
-            })?;
     }
-    #[cfg(not(feature = "parallel"))]
-    {
-        let mut scratch = DecodeScratch::default();
-        for (task, out) in values.chunks_mut(LEAVES_PER_TASK * per_leaf).enumerate() {
-            decode_some(task, out, &mut scratch)?;
-        }
-    }
-    Ok(values)
 }
 
 /// Decodes the values of a leaf from where the reader stands.

@@ -11,6 +11,7 @@
 pub(crate) mod blosc;
 pub(crate) mod blosc_encoder;
 mod blosclz;
+mod inflate;
 mod shuffle;
 pub(crate) mod zlib;
 
@@ -31,9 +32,7 @@ pub(crate) enum CodecError {
 pub(crate) struct Scratch {
     /// A Blosc block before its shuffle is undone.
     shuffled: Vec<u8>,
-    inflate: Option<flate2::Decompress>,
-    /// What a zlib stream gives, with room behind it.
-    inflated: Vec<u8>,
+    inflater: Option<Box<inflate::Inflater>>,
     zstd: Option<ruzstd::decoding::FrameDecoder>,
 }
 

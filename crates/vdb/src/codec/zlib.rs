@@ -1,18 +1,14 @@
-//! One zlib stream, inflated into a slice of known size, or deflated if that makes it smaller.
+//! One zlib stream (RFC 1950), inflated into a slice of known size, or deflated if that makes it smaller.
 //!
-//! Both are flate2's work; here are only the rules that a block must fill its slice exactly, and that it must
-//! shrink.
+//! Deflating is flate2's work. Inflating is [`super::inflate`]'s: it is what reading a ZIP-compressed file waits for.
 
-use flate2::{Compress, Compression, Decompress, FlushCompress, FlushDecompress, Status};
+use flate2::{Compress, Compression, FlushCompress, Status};
 
+use super::inflate::Inflater;
 use super::{CodecError, EncodeScratch, Scratch};
 
 /// OpenVDB's own level, and zlib's default.
 const LEVEL: u32 = 6;
-
-/// The fast loop of the inflater ends where less room than this is left. Values are a few kilobytes: without that room
-/// behind them, a good part of each block would go through the slow loop.
-const FAST_LOOP_BYTES: usize = 320;
 
 /// Inflates the zlib stream at the start of `data` into `out`. Bytes after the stream's end are ignored, as
 /// zlib's own one-call function does.
@@ -20,19 +16,17 @@ const FAST_LOOP_BYTES: usize = 320;
 /// # Errors
 /// `Malformed` if the stream is damaged, fails its checksum, or gives fewer or more bytes than `out` holds.
 pub(crate) fn decompress(data: &[u8], out: &mut [u8], scratch: &mut Scratch) -> Result<(), CodecError> {
-    let Scratch { inflate, inflated, .. } = scratch;
-    let inflate = inflate.get_or_insert_with(|| Decompress::new(true));
-    inflate.reset(true);
-    inflated.resize(out.len() + FAST_LOOP_BYTES, 0);
-    match inflate.decompress(data, inflated, FlushDecompress::Finish) {
-        Ok(Status::StreamEnd) if inflate.total_out() == out.len() as u64 => {
-            out.copy_from_slice(&inflated[..out.len()]);
-            Ok(())
-        }
-        Ok(_) => {
-            Err(CodecError::Malformed("a zlib stream that does not give the size its block should have"))
-        }
-        Err(_) => Err(CodecError::Malformed("a damaged zlib stream")),
+    let (header, stream) = data.split_first_chunk::<2>().ok_or(CodecError::Malformed("a cut zlib stream"))?;
+    let is_header = u16::from_be_bytes(*header) % 31 == 0 && header[0] & 0xf == 8 && header[0] >> 4 <= 7;
+    let has_dictionary = header[1] & 0x20 != 0;
+    if !is_header || has_dictionary {
+        return Err(CodecError::Malformed("bytes that do not begin as a zlib stream does"));
+    }
+    let end = scratch.inflater.get_or_insert_with(Inflater::new).inflate(stream, out)?;
+    let checksum = stream[end..].first_chunk().ok_or(CodecError::Malformed("a cut zlib stream"))?;
+    match u32::from_be_bytes(*checksum) == simd_adler32::adler32(&&*out) {
+        true => Ok(()),
+        false => Err(CodecError::Malformed("a zlib stream with a wrong checksum")),
     }
 }
 
