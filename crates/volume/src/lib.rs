@@ -29,5 +29,6 @@ pub mod accessor;
 pub mod brick;
 pub mod build;
 pub mod channel;
+pub mod codec;
 pub mod space;
 pub mod tree;

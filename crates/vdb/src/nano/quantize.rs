@@ -123,8 +123,8 @@ mod tests {
         ) {
             let quantizer = Quantizer::covering(&values, bits).unwrap();
             for value in values {
-                // The sum of minimum and quanta is rounded once more.
-                let most = 0.5001 * quantizer.quantum + 1000.0 * f32::EPSILON;
+                // The range, the quantum, their product and the sum are each rounded at magnitudes of up to 2000.
+                let most = 0.5001 * quantizer.quantum + 4.0 * 1000.0 * f32::EPSILON;
                 prop_assert!((quantizer.round(value) - value).abs() <= most);
             }
         }

@@ -1,0 +1,295 @@
+//! How the values of a brick are stored: the codecs and their decoders.
+//!
+//! An encoded brick is a [`Codec`] and some words in the store that all bricks of a volume share. This module decodes;
+//! [`codes`] reads codes of few bits, [`bounds`] the bounds of an entry. Encoders, and the choice among codecs, live in
+//! the pipeline. What a tree is, and where bricks stand in it, is [`crate::packed`]'s.
+//!
+//! A channel has a *unit*, a power of two no smaller than any of its values, and a *floor*, the smallest value it can
+//! have. Half floats in a brick count in units. Every decoded value is raised to the floor: predictions that run below it
+//! end there, which is what keeps empty voxels empty.
+
+pub mod bounds;
+pub mod codes;
+
+use crate::brick::f32_from_finite_f16;
+use crate::space::BRICK_VOXELS;
+
+/// How a brick is stored.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub enum Codec {
+    /// One value, which stands in the entry itself.
+    Constant,
+    /// 512 floats: 512 words.
+    F32,
+    /// 512 half floats in units: 256 words.
+    F16,
+    /// Codes of 1 to 8 bits between bounds of the brick: a word with the value of code 0 and the step between codes,
+    /// both half floats in units, then `16 × bits` words of codes.
+    Uniform {
+        /// The bits of a code.
+        bits: u8,
+    },
+    /// The trilinear interpolation of eight corners, and what differs from it as in [`Codec::Uniform`]: a word for the
+    /// corners like that of the codes, two words of 8-bit codes of the corners, then, unless `bits` is 0, the words of
+    /// [`Codec::Uniform`].
+    Gradient {
+        /// The bits of a code, 0 to 8.
+        bits: u8,
+    },
+    /// The values of another brick, its shape, scaled: a word with bias and scale, both half floats in units (the shape's
+    /// own values count as they are); the shape's offset; the tag of the shape's codec.
+    Shared,
+}
+
+impl Codec {
+    /// The codec's number in a file.
+    pub fn tag(self) -> u8 {
+        match self {
+            Codec::Constant => 0,
+            Codec::Uniform { bits } => bits,
+            Codec::F16 => 9,
+            Codec::F32 => 10,
+            Codec::Shared => 11,
+            Codec::Gradient { bits } => 16 + bits,
+        }
+    }
+
+    /// The codec of a number in a file.
+    pub fn from_tag(tag: u8) -> Option<Codec> {
+        match tag {
+            0 => Some(Codec::Constant),
+            1..=8 => Some(Codec::Uniform { bits: tag }),
+            9 => Some(Codec::F16),
+            10 => Some(Codec::F32),
+            11 => Some(Codec::Shared),
+            16..=24 => Some(Codec::Gradient { bits: tag - 16 }),
+            _ => None,
+        }
+    }
+
+    /// The words of a brick.
+    pub fn word_count(self) -> usize {
+        match self {
+            Codec::Constant => 0,
+            Codec::F32 => BRICK_VOXELS,
+            Codec::F16 => BRICK_VOXELS / 2,
+            Codec::Uniform { bits } => 1 + codes::word_count(bits),
+            Codec::Gradient { bits: 0 } => 3,
+            Codec::Gradient { bits } => 4 + codes::word_count(bits),
+            Codec::Shared => 3,
+        }
+    }
+}
+
+/// Why a brick cannot be decoded.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum DecodeError {
+    /// Its words are not all there.
+    #[error("a brick stands outside of the brick store")]
+    OutOfStore,
+    /// Its shape is no brick, or a shared one itself.
+    #[error("a shared brick without a shape")]
+    NoShape,
+    /// It holds a half float that is infinite or no number.
+    #[error("a brick with a number that is none")]
+    NotFinite,
+}
+
+/// What a brick needs to be decoded, besides its codec and place.
+#[derive(Debug, Clone, Copy)]
+pub struct BrickContext<'a> {
+    /// The brick store.
+    pub words: &'a [u32],
+    /// The unit of half floats: a power of two.
+    pub unit: f32,
+    /// The smallest value.
+    pub floor: f32,
+}
+
+/// A line of values: `at(code) = low + step × code`, one multiplication and one addition in f32.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Line {
+    /// The value of code 0.
+    pub low: f32,
+    /// The step between codes.
+    pub step: f32,
+}
+
+impl Line {
+    /// The line of a word: `low` in the lower half, `step` in the upper.
+    ///
+    /// # Errors
+    /// If one of them is not finite.
+    pub fn from_word(word: u32, unit: f32) -> Result<Line, DecodeError> {
+        let half = |bits: u32| match bits & 0x7c00 {
+            0x7c00 => Err(DecodeError::NotFinite),
+            _ => Ok(f32_from_finite_f16(bits as u16) * unit),
+        };
+        Ok(Line { low: half(word & 0xffff)?, step: half(word >> 16)? })
+    }
+
+    /// The value of a code.
+    pub fn at(self, code: u32) -> f32 {
+        self.low + self.step * code as f32
+    }
+}
+
+fn mix(a: f32, b: f32, t: f32) -> f32 {
+    a + (b - a) * t
+}
+
+/// The trilinear interpolation of eight corners, corner `x << 2 | y << 1 | z`, at the voxels of a brick, whose first
+/// voxel is the first corner and whose last is the last: first along x, then y, then z.
+pub fn interpolate_corners(corners: &[f32; 8], out: &mut [f32; BRICK_VOXELS]) {
+    let (planes, _) = out.as_chunks_mut::<64>();
+    for (x, plane) in planes.iter_mut().enumerate() {
+        let t = x as f32 / 7.0;
+        let edge: [f32; 4] = std::array::from_fn(|i| mix(corners[i], corners[4 + i], t));
+        let (rows, _) = plane.as_chunks_mut::<8>();
+        for (y, row) in rows.iter_mut().enumerate() {
+            let t = y as f32 / 7.0;
+            let (low, high) = (mix(edge[0], edge[2], t), mix(edge[1], edge[3], t));
+            for (z, value) in row.iter_mut().enumerate() {
+                *value = mix(low, high, z as f32 / 7.0);
+            }
+        }
+    }
+}
+
+impl BrickContext<'_> {
+    /// Decodes a brick that is not [`Codec::Constant`].
+    ///
+    /// # Errors
+    /// If its words are not all there or hold what none can.
+    pub fn decode(
+        &self,
+        codec: Codec,
+        offset: u32,
+        out: &mut [f32; BRICK_VOXELS],
+    ) -> Result<(), DecodeError> {
+        self.decode_above(codec, offset, out, true)?;
+        out.iter_mut().for_each(|value| *value = value.max(self.floor));
+        Ok(())
+    }
+
+    /// Decodes a brick without regard to the floor.
+    fn decode_above(
+        &self,
+        codec: Codec,
+        offset: u32,
+        out: &mut [f32; BRICK_VOXELS],
+        may_share: bool,
+    ) -> Result<(), DecodeError> {
+        let begin = offset as usize;
+        let words = begin.checked_add(codec.word_count()).and_then(|end| self.words.get(begin..end));
+        let words = words.ok_or(DecodeError::OutOfStore)?;
+        match (codec, words) {
+            (Codec::F32, words) => {
+                for (value, word) in out.iter_mut().zip(words) {
+                    *value = f32::from_bits(*word);
+                    if !value.is_finite() {
+                        return Err(DecodeError::NotFinite);
+                    }
+                }
+            }
+            (Codec::F16, words) => {
+                for (pair, word) in out.as_chunks_mut::<2>().0.iter_mut().zip(words) {
+                    // Two half floats stand in a word as low and step do.
+                    let Line { low, step } = Line::from_word(*word, self.unit)?;
+                    *pair = [low, step];
+                }
+            }
+            (Codec::Uniform { bits }, [line, words @ ..]) => {
+                let line = Line::from_word(*line, self.unit)?;
+                codes::unpack(bits, words, out, |_, code| line.at(code));
+            }
+            (Codec::Gradient { bits }, [line, low, high, rest @ ..]) => {
+                let line = Line::from_word(*line, self.unit)?;
+                let code = |i: usize| [low, high][i / 4] >> (i % 4 * 8) & 0xff;
+                interpolate_corners(&std::array::from_fn(|i| line.at(code(i))), out);
+                if let [line, words @ ..] = rest {
+                    let line = Line::from_word(*line, self.unit)?;
+                    codes::unpack(bits, words, out, |predicted, code| predicted + line.at(code));
+                }
+            }
+            (Codec::Shared, [line, shape, tag]) if may_share => {
+                let line = Line::from_word(*line, self.unit)?;
+                let codec = u8::try_from(*tag).ok().and_then(Codec::from_tag);
+                let codec = codec.filter(|codec| !matches!(codec, Codec::Constant | Codec::Shared));
+                let shapes = BrickContext { unit: 1.0, ..*self };
+                shapes.decode_above(codec.ok_or(DecodeError::NoShape)?, *shape, out, false)?;
+                out.iter_mut().for_each(|value| *value = line.low + line.step * *value);
+            }
+            _ => return Err(DecodeError::NoShape),
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const HALF_ONE: u32 = 0x3c00;
+
+    #[test]
+    fn tags_and_codecs_are_inverse() {
+        let all: Vec<Codec> = (0..=255).filter_map(Codec::from_tag).collect();
+        assert_eq!(all.len(), 21);
+        for (i, codec) in all.iter().enumerate() {
+            assert_eq!(Codec::from_tag(codec.tag()), Some(*codec));
+            assert!(!all[..i].contains(codec));
+        }
+    }
+
+    #[test]
+    fn values_are_what_the_words_say() {
+        let mut words = vec![0; 1024];
+        // Uniform at 4: low 1, step 2 in units of 4; all codes 3.
+        words[4] = HALF_ONE | 0x4000 << 16;
+        words[5..37].fill(u32::MAX);
+        // Gradient at 100: corners 0, 0, …, 255; step 1.
+        (words[100], words[102]) = (HALF_ONE << 16, 255 << 24);
+        let context = BrickContext { words: &words, unit: 4.0, floor: 0.0 };
+        let mut out = [0.0; BRICK_VOXELS];
+        context.decode(Codec::Uniform { bits: 2 }, 4, &mut out).unwrap();
+        assert_eq!(out, [4.0 + 8.0 * 3.0; BRICK_VOXELS]);
+        context.decode(Codec::Gradient { bits: 0 }, 100, &mut out).unwrap();
+        assert_eq!((out[0], out[7], out[511]), (0.0, 0.0, 1020.0));
+        let expected = 1020.0 * (3.0 / 7.0) * (5.0 / 7.0) * (6.0 / 7.0);
+        assert!((out[3 << 6 | 5 << 3 | 6] - expected).abs() < 1e-3);
+        // A shared brick at 200 of the first, in units of 1: 28 becomes 1 + 7 × 0.5, in units of 4.
+        words[200..203].copy_from_slice(&[HALF_ONE | 0x3800 << 16, 4, 2]);
+        let context = BrickContext { words: &words, unit: 4.0, floor: 0.0 };
+        context.decode(Codec::Shared, 200, &mut out).unwrap();
+        assert_eq!(out, [4.0 + 2.0 * 7.0; BRICK_VOXELS]);
+    }
+
+    #[test]
+    fn nothing_is_below_the_floor() {
+        let words = [0xbc00, 0, 0].map(|word: u32| word);
+        let mut out = [1.0; BRICK_VOXELS];
+        for (floor, expected) in [(0.0, 0.0), (-0.5, -0.5), (f32::MIN, -1.0)] {
+            let context = BrickContext { words: &words, unit: 1.0, floor };
+            context.decode(Codec::Gradient { bits: 0 }, 0, &mut out).unwrap();
+            assert_eq!(out, [expected; BRICK_VOXELS]);
+        }
+    }
+
+    #[test]
+    fn what_is_not_there_or_no_number_is_an_error() {
+        let mut words = vec![0; 600];
+        words[1] = 0x7c00;
+        words[2] = 0x7e00 << 16;
+        words[3..6].copy_from_slice(&[0, 0, 11]);
+        let context = BrickContext { words: &words, unit: 1.0, floor: 0.0 };
+        let mut out = [0.0; BRICK_VOXELS];
+        let mut decode = |codec, offset| context.decode(codec, offset, &mut out);
+        assert_eq!(decode(Codec::F32, 100), Err(DecodeError::OutOfStore));
+        assert_eq!(decode(Codec::F16, u32::MAX), Err(DecodeError::OutOfStore));
+        assert_eq!(decode(Codec::Uniform { bits: 1 }, 1), Err(DecodeError::NotFinite));
+        assert_eq!(decode(Codec::Uniform { bits: 8 }, 2), Err(DecodeError::NotFinite));
+        assert_eq!(decode(Codec::Shared, 3), Err(DecodeError::NoShape));
+        assert_eq!(decode(Codec::Constant, 3), Err(DecodeError::NoShape));
+    }
+}
