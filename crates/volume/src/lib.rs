@@ -30,5 +30,6 @@ pub mod brick;
 pub mod build;
 pub mod channel;
 pub mod codec;
+pub mod packed;
 pub mod space;
 pub mod tree;
