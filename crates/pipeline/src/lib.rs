@@ -9,6 +9,7 @@
 
 #![forbid(unsafe_code)]
 
+pub mod encode;
 pub mod import;
 #[cfg(feature = "fs")]
 pub mod output;

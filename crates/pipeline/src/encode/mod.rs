@@ -1,0 +1,8 @@
+//! From the values of bricks to their codecs and words.
+//!
+//! [`quantize`] measures and writes one brick in each of the codecs of few bits; [`choose`] takes, brick by brick, the
+//! cheapest that keeps to what was asked for. The decoders, which say what the words mean, live in
+//! [`nuage_volume::codec`].
+
+pub mod choose;
+pub mod quantize;

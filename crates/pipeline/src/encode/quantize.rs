@@ -1,0 +1,417 @@
+//! One brick in each of the codecs that quantise: what it costs, how far off it is, and its words.
+//!
+//! Uniform codes cover the values themselves, gradient codes what a trilinear interpolation of eight fitted corners
+//! leaves over, which in smoke is several bits less. Errors are measured on values as the decoder gives them.
+//!
+//! Empty voxels, those at the channel's floor, are special: decoded values are raised to the floor, so a code whose
+//! value lies below it is as good as exact. Such voxels take the next code below and get exactly the floor.
+
+use half::f16;
+use nuage_volume::codec::{BrickContext, Codec, Line, codes, interpolate_corners};
+use nuage_volume::space::BRICK_VOXELS;
+
+/// The values of a brick.
+pub type Brick = [f32; BRICK_VOXELS];
+
+/// What the encoder has to know of a channel.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ChannelScale {
+    /// The unit of half floats: a power of two, not less than any magnitude.
+    pub unit: f32,
+    /// The smallest value that the channel can have: decoded values are raised to it.
+    pub floor: f32,
+    /// The value of empty voxels.
+    pub background: f32,
+    /// How far off empty voxels may be.
+    pub background_tolerance: f32,
+    /// Whether no value may change its sign.
+    pub keeps_sign: bool,
+}
+
+/// How far a coded brick is from its source.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Error {
+    /// The sum of squares over all voxels.
+    pub squared: f64,
+    /// The largest of a voxel.
+    pub max: f32,
+}
+
+/// The codecs that are tried, the cheapest first.
+pub const CODECS: [Codec; 19] = [
+    Codec::Constant,
+    Codec::Gradient { bits: 0 },
+    Codec::Uniform { bits: 1 },
+    Codec::Gradient { bits: 1 },
+    Codec::Uniform { bits: 2 },
+    Codec::Gradient { bits: 2 },
+    Codec::Uniform { bits: 3 },
+    Codec::Gradient { bits: 3 },
+    Codec::Uniform { bits: 4 },
+    Codec::Gradient { bits: 4 },
+    Codec::Uniform { bits: 5 },
+    Codec::Gradient { bits: 5 },
+    Codec::Uniform { bits: 6 },
+    Codec::Gradient { bits: 6 },
+    Codec::Uniform { bits: 8 },
+    Codec::Gradient { bits: 7 },
+    Codec::Gradient { bits: 8 },
+    Codec::F16,
+    Codec::F32,
+];
+
+/// The error of a brick in each of [`CODECS`], `None` where the codec cannot hold it: empty voxels would not stay
+/// empty, or a sign would change. [`Codec::F32`] always can.
+pub fn measure(values: &Brick, scale: &ChannelScale) -> [Option<Error>; CODECS.len()] {
+    let gradient = Gradient::fit(values, scale);
+    let zero = [0.0; BRICK_VOXELS];
+    CODECS.map(|codec| match codec {
+        Codec::Constant => check(values, &[constant(values); BRICK_VOXELS], scale),
+        Codec::Uniform { bits } => {
+            let line = line_over(values, &zero, scale, bits);
+            quantized_error(values, &zero, line, bits, scale)
+        }
+        Codec::Gradient { bits: 0 } => check(values, &floored(gradient.predicted, scale.floor), scale),
+        Codec::Gradient { bits } => {
+            let line = line_over(values, &gradient.predicted, scale, bits);
+            quantized_error(values, &gradient.predicted, line, bits, scale)
+        }
+        Codec::F16 => {
+            let rounded = values.map(|value| f16::from_f32(value / scale.unit).to_f32() * scale.unit);
+            check(values, &rounded, scale)
+        }
+        Codec::F32 | Codec::Shared => Some(Error::default()),
+    })
+}
+
+/// The value that stands for a brick of [`Codec::Constant`]: halfway between its bounds.
+pub fn constant(values: &Brick) -> f32 {
+    let (min, max) = bounds(values.iter().copied());
+    // A sum of halves does not overflow.
+    (0.5 * min + 0.5 * max).clamp(min, max)
+}
+
+/// Appends the words of a brick in a codec: those that [`measure`] measured.
+///
+/// # Panics
+/// If the codec is not one of [`CODECS`].
+pub fn write(values: &Brick, codec: Codec, scale: &ChannelScale, words: &mut Vec<u32>) {
+    match codec {
+        Codec::Constant => {}
+        Codec::Uniform { bits } => {
+            let zero = [0.0; BRICK_VOXELS];
+            let line = line_over(values, &zero, scale, bits);
+            words.push(line.word);
+            codes::pack(bits, &quantize(values, &zero, line, bits, scale), words);
+        }
+        Codec::Gradient { bits } => {
+            let gradient = Gradient::fit(values, scale);
+            words.push(gradient.line.word);
+            words.extend(gradient.codes.as_chunks::<4>().0.iter().map(|codes| u32::from_le_bytes(*codes)));
+            if bits > 0 {
+                let line = line_over(values, &gradient.predicted, scale, bits);
+                words.push(line.word);
+                codes::pack(bits, &quantize(values, &gradient.predicted, line, bits, scale), words);
+            }
+        }
+        Codec::F16 => {
+            let half = |value: f32| u32::from(f16::from_f32(value / scale.unit).to_bits());
+            let pairs = values.as_chunks::<2>().0;
+            words.extend(pairs.iter().map(|[low, high]| half(*low) | half(*high) << 16));
+        }
+        Codec::F32 => words.extend(values.iter().map(|value| value.to_bits())),
+        Codec::Shared => unreachable!("a shared brick needs a shape"),
+    }
+}
+
+/// A line as a brick stores it.
+#[derive(Debug, Clone, Copy)]
+struct StoredLine {
+    line: Line,
+    word: u32,
+}
+
+impl StoredLine {
+    /// The line of codes up to `last_code` that covers `min` to `max`: half floats, rounded outward.
+    fn covering(min: f32, max: f32, last_code: u32, unit: f32) -> StoredLine {
+        let low = half_not_above(min / unit);
+        let step = half_not_below((max / unit - low.to_f32()) / last_code as f32);
+        let word = u32::from(low.to_bits()) | u32::from(step.to_bits()) << 16;
+        let line = Line { low: low.to_f32() * unit, step: step.to_f32() * unit };
+        StoredLine { line, word }
+    }
+}
+
+fn half_not_above(value: f32) -> f16 {
+    let nearest = f16::from_f32(value);
+    match nearest.to_f32() > value {
+        // The next smaller one: down in magnitude for positive numbers, up for others.
+        true if nearest.to_bits() == 0 => f16::from_bits(0x8001),
+        true if nearest.is_sign_positive() => f16::from_bits(nearest.to_bits() - 1),
+        true => f16::from_bits(nearest.to_bits() + 1),
+        false => nearest,
+    }
+}
+
+fn half_not_below(value: f32) -> f16 {
+    -half_not_above(-value)
+}
+
+fn bounds(values: impl Iterator<Item = f32>) -> (f32, f32) {
+    values.fold((f32::INFINITY, f32::NEG_INFINITY), |(min, max), value| {
+        (if value < min { value } else { min }, if value > max { value } else { max })
+    })
+}
+
+/// The line of the codes of what the values differ from a prediction. Voxels at the floor need a code that leads to or
+/// below it, and none above.
+fn line_over(values: &Brick, predicted: &Brick, scale: &ChannelScale, bits: u8) -> StoredLine {
+    let (mut min, mut max) = (f32::INFINITY, f32::NEG_INFINITY);
+    for (value, predicted) in values.iter().zip(predicted) {
+        let residual = value - predicted;
+        min = if residual < min { residual } else { min };
+        let above = if *value == scale.floor { f32::NEG_INFINITY } else { residual };
+        max = if above > max { above } else { max };
+    }
+    StoredLine::covering(min, max.max(min), (1 << bits) - 1, scale.unit)
+}
+
+/// Adding and taking away this rounds a float below 2²² to the nearest whole number.
+const ROUNDING: f32 = 12_582_912.0;
+
+/// The code of a voxel, as a float.
+fn code_of(value: f32, predicted: f32, line: Line, inverse: f32, last_code: f32, floor: f32) -> f32 {
+    let exact = (value - predicted - line.low) * inverse;
+    let down = if value == floor { 0.5 } else { 0.0 };
+    let code = (exact - down + ROUNDING) - ROUNDING;
+    // Not `clamp`, which checks its bounds each time.
+    let code = if code > 0.0 { code } else { 0.0 };
+    if code < last_code { code } else { last_code }
+}
+
+fn inverse(line: Line) -> f32 {
+    if line.step > 0.0 { 1.0 / line.step } else { 0.0 }
+}
+
+fn quantize(
+    values: &Brick,
+    predicted: &Brick,
+    line: StoredLine,
+    bits: u8,
+    scale: &ChannelScale,
+) -> [u8; BRICK_VOXELS] {
+    let (inverse, last_code) = (inverse(line.line), f32::from((1_u16 << bits) - 1));
+    std::array::from_fn(|i| {
+        code_of(values[i], predicted[i], line.line, inverse, last_code, scale.floor) as u8
+    })
+}
+
+fn quantized_error(
+    values: &Brick,
+    predicted: &Brick,
+    line: StoredLine,
+    bits: u8,
+    scale: &ChannelScale,
+) -> Option<Error> {
+    let StoredLine { line, .. } = line;
+    let (inverse, last_code) = (inverse(line), f32::from((1_u16 << bits) - 1));
+    let mut decoded = [0.0; BRICK_VOXELS];
+    for (i, decoded) in decoded.iter_mut().enumerate() {
+        let code = code_of(values[i], predicted[i], line, inverse, last_code, scale.floor);
+        *decoded = predicted[i] + (line.low + line.step * code);
+    }
+    check(values, &floored(decoded, scale.floor), scale)
+}
+
+fn floored(mut values: Brick, floor: f32) -> Brick {
+    values.iter_mut().for_each(|value| *value = if *value < floor { floor } else { *value });
+    values
+}
+
+/// The error of decoded values, `None` if an empty voxel is not empty or a sign changed.
+fn check(values: &Brick, decoded: &Brick, scale: &ChannelScale) -> Option<Error> {
+    const LANES: usize = 8;
+    let (mut squared, mut max, mut fog, mut flips) =
+        ([0.0_f32; LANES], [0.0_f32; LANES], [0.0_f32; LANES], 0);
+    for (values, decoded) in values.as_chunks::<LANES>().0.iter().zip(decoded.as_chunks::<LANES>().0) {
+        for i in 0..LANES {
+            let error = (decoded[i] - values[i]).abs();
+            squared[i] += error * error;
+            max[i] = if error > max[i] { error } else { max[i] };
+            let in_empty = if values[i] == scale.background { error } else { 0.0 };
+            fog[i] = if in_empty > fog[i] { in_empty } else { fog[i] };
+            flips += u32::from((values[i] < 0.0) != (decoded[i] < 0.0));
+        }
+    }
+    let largest = |lanes: [f32; LANES]| lanes.iter().copied().fold(0.0, f32::max);
+    let is_sound = largest(fog) <= scale.background_tolerance && !(scale.keeps_sign && flips > 0);
+    let squared: f64 = squared.iter().map(|lane| f64::from(*lane)).sum();
+    // Squares of large values overflow: such a codec is of no use. False for NaN.
+    (is_sound && squared < f64::from(f32::MAX)).then(|| Error { squared, max: largest(max) })
+}
+
+/// The corners of a brick and what they predict.
+struct Gradient {
+    line: StoredLine,
+    codes: [u8; 8],
+    predicted: Brick,
+}
+
+/// The least-squares fit of a line through eight values at 0 to 7: weights of the value at each end. With the positions
+/// t from 0 to 1, those of the ends are `1/8 ± (t - 1/2) / (2 Σ (t - 1/2)²)` and the sum is 6/7.
+const FIT: [[f32; 8]; 2] = {
+    let mut weights = [[0.0; 8]; 2];
+    let mut i = 0;
+    while i < 8 {
+        let tilt = (i as f32 / 7.0 - 0.5) / (2.0 * 6.0 / 7.0);
+        weights[0][i] = 0.125 - tilt;
+        weights[1][i] = 0.125 + tilt;
+        i += 1;
+    }
+    weights
+};
+
+/// How often the fit is repeated where some voxels are empty.
+const EMPTY_ROUNDS: usize = 3;
+
+impl Gradient {
+    /// Fits corners. What they predict below the floor is as good as the floor, so where voxels are empty they are
+    /// fitted to what was predicted there before, as far as that is below.
+    fn fit(values: &Brick, scale: &ChannelScale) -> Gradient {
+        let mut target = *values;
+        let has_empty = values.contains(&scale.floor);
+        let mut corners = fit_corners(&target);
+        if has_empty {
+            let mut predicted = [0.0; BRICK_VOXELS];
+            for _ in 0..EMPTY_ROUNDS {
+                interpolate_corners(&corners, &mut predicted);
+                for i in 0..BRICK_VOXELS {
+                    let is_below = values[i] == scale.floor && predicted[i] < scale.floor;
+                    target[i] = if is_below { predicted[i] } else { values[i] };
+                }
+                corners = fit_corners(&target);
+            }
+        }
+        // Below the unit there is nothing to fit, and a half float ends.
+        let corners = corners.map(|corner| corner.clamp(-4.0 * scale.unit, 4.0 * scale.unit));
+        let (min, max) = bounds(corners.into_iter());
+        let line = StoredLine::covering(min, max, 255, scale.unit);
+        let inverse = inverse(line.line);
+        let codes =
+            corners.map(|corner| ((corner - line.line.low) * inverse).round().clamp(0.0, 255.0) as u8);
+        let mut predicted = [0.0; BRICK_VOXELS];
+        interpolate_corners(&codes.map(|code| line.line.at(code.into())), &mut predicted);
+        Gradient { line, codes, predicted }
+    }
+}
+
+/// The corners whose trilinear interpolation is closest to the values.
+fn fit_corners(values: &Brick) -> [f32; 8] {
+    // One axis after the other: rows of eight become pairs.
+    let mut along_z = [[0.0; 2]; 64];
+    for (pair, row) in along_z.iter_mut().zip(values.as_chunks::<8>().0) {
+        for (i, value) in row.iter().enumerate() {
+            pair[0] += FIT[0][i] * value;
+            pair[1] += FIT[1][i] * value;
+        }
+    }
+    let mut along_y = [[0.0; 4]; 8];
+    for (x, plane) in along_y.iter_mut().enumerate() {
+        for (i, pair) in along_z[x * 8..x * 8 + 8].iter().enumerate() {
+            for (corner, value) in plane.iter_mut().enumerate() {
+                *value += FIT[corner >> 1][i] * pair[corner & 1];
+            }
+        }
+    }
+    std::array::from_fn(|corner| (0..8).map(|x| FIT[corner >> 2][x] * along_y[x][corner & 3]).sum())
+}
+
+/// Decodes words that [`write()`] wrote.
+pub fn decode(codec: Codec, words: &[u32], scale: &ChannelScale, out: &mut Brick) -> bool {
+    let context = BrickContext { words, unit: scale.unit, floor: scale.floor };
+    context.decode(codec, 0, out).is_ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn scale(background: f32) -> ChannelScale {
+        let floor = if background == 0.0 { 0.0 } else { f32::MIN };
+        ChannelScale {
+            unit: 8.0,
+            floor,
+            background,
+            background_tolerance: 1e-3,
+            keeps_sign: background != 0.0,
+        }
+    }
+
+    /// A plume: smooth, with empty voxels beyond a plane.
+    fn brick(normal: [f32; 3], offset: f32, curve: f32, noise: f32, is_distance: bool) -> Brick {
+        std::array::from_fn(|i| {
+            let p = [i >> 6, i >> 3 & 7, i & 7].map(|c| c as f32 / 7.0);
+            let plane: f32 = p.iter().zip(normal).map(|(p, n)| p * n).sum::<f32>() + offset;
+            let grain = ((i as u32).wrapping_mul(2_654_435_761) >> 16) as f32 / 65536.0;
+            let value = plane + curve * p[0] * p[1] * p[1] + noise * grain;
+            if is_distance { value.clamp(-1.0, 1.0) } else { value.clamp(0.0, 8.0) }
+        })
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(100))]
+
+        #[test]
+        fn the_decoder_gives_what_was_measured(
+            normal in [-2.0_f32..2.0, -2.0_f32..2.0, -2.0_f32..2.0], offset in -1.0_f32..3.0, curve in -1.0_f32..1.0,
+            noise in prop::sample::select(vec![0.0_f32, 0.01, 1.0]), is_distance in any::<bool>(),
+        ) {
+            let values = brick(normal, offset, curve, noise, is_distance);
+            let scale = scale(if is_distance { 1.0 } else { 0.0 });
+            let errors = measure(&values, &scale);
+            prop_assert!(errors[CODECS.len() - 1] == Some(Error::default()));
+            for (codec, error) in CODECS.into_iter().zip(errors) {
+                let Some(error) = error else { continue };
+                let mut words = Vec::new();
+                write(&values, codec, &scale, &mut words);
+                prop_assert_eq!(words.len(), codec.word_count());
+                let mut decoded = [constant(&values); BRICK_VOXELS];
+                if codec != Codec::Constant {
+                    prop_assert!(decode(codec, &words, &scale, &mut decoded));
+                }
+                let max = values.iter().zip(&decoded).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+                let squared: f64 = values.iter().zip(&decoded).map(|(a, b)| f64::from(a - b).powi(2)).sum();
+                prop_assert_eq!(max, error.max, "{:?}", codec);
+                prop_assert!((squared - error.squared).abs() <= 1e-4 * squared + 1e-12);
+                for (value, decoded) in values.iter().zip(&decoded) {
+                    prop_assert!(*value != scale.background || (decoded - value).abs() <= 1e-3);
+                    prop_assert!(!scale.keeps_sign || (*value < 0.0) == (*decoded < 0.0));
+                }
+                // A uniform code is off by half a step, which is a little wider than the range asks for.
+                if let Codec::Uniform { bits } = codec {
+                    let (min, max) = bounds(values.iter().copied());
+                    let step = (max - min) / f32::from((1_u16 << bits) - 1);
+                    prop_assert!(error.max <= 0.51 * step + 0.01, "{bits} {}", error.max);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_linear_ramp_is_its_corners() {
+        let values = brick([1.0, 0.5, 0.25], 1.0, 0.0, 0.0, false);
+        let errors = measure(&values, &scale(0.0));
+        assert!(errors[1].is_some_and(|error| error.max < 0.01), "{:?}", errors[1]);
+        assert!(errors[2].is_some_and(|error| error.max > 0.2));
+    }
+
+    #[test]
+    fn half_floats_are_rounded_to_the_side_asked_for() {
+        for value in [0.0, 1.0, 0.1, -0.1, 1e-9, -1e-9, 1.0 / 3.0, -123.456] {
+            let (below, above) = (half_not_above(value).to_f32(), half_not_below(value).to_f32());
+            assert!(below <= value && value <= above, "{below} {value} {above}");
+            assert!((above - below).abs() <= value.abs() / 1000.0 + 1e-7);
+        }
+    }
+}
