@@ -2,7 +2,7 @@
 //!
 //! Modules from the bottom up: [`space`] (address arithmetic), [`brick`] (voxel values), [`tree`] (the arrays
 //! and single look-ups), [`accessor`] (fast look-ups and interpolation), [`build`] (from bricks and tiles to a
-//! tree), [`channel`] (a tree in the world).
+//! tree), [`channel`] (a tree in the world). Beside them: [`codec`] (bricks in fewer bytes).
 //!
 //! ```
 //! use glam::{IVec3, Vec3};
@@ -29,5 +29,6 @@ pub mod accessor;
 pub mod brick;
 pub mod build;
 pub mod channel;
+pub mod codec;
 pub mod space;
 pub mod tree;
