@@ -79,8 +79,9 @@ fn channel(
 ) -> [f32; 16] {
     let [.., along_packing] = axis.strides();
     std::array::from_fn(|texel| {
-        // In this order NaN becomes 0.
-        brick[voxel_offset(format, axis, block, texel) + channel * along_packing].max(0.0).min(1.0)
+        let value = brick[voxel_offset(format, axis, block, texel) + channel * along_packing];
+        // So NaN becomes 0.
+        if value > 0.0 { value.min(1.0) } else { 0.0 }
     })
 }
 
@@ -244,7 +245,7 @@ mod tests {
                 state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
                 f32::from_bits((state >> 32) as u32)
             });
-            let clamped: [f32; BRICK_VOXELS] = values.map(|value: f32| value.max(0.0).min(1.0));
+            let clamped: [f32; BRICK_VOXELS] = values.map(|value: f32| if value.is_nan() { 0.0 } else { value.clamp(0.0, 1.0) });
             for quality in QUALITIES {
                 let encode = |values| encode_brick(FORMATS[format], PackingAxis::Z, values, quality);
                 prop_assert_eq!(encode(&values), encode(&clamped));
