@@ -1,5 +1,5 @@
-//! Names the C++ runtime for the linker where the native encoders need it: their library holds a C++ object, and
-//! does not say so.
+//! Names the C++ runtime for the linker where the native encoders need it: their library holds a C++ object,
+//! and does not say so.
 
 fn main() {
     println!("cargo:rerun-if-changed=build.rs");

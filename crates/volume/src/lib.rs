@@ -1,8 +1,8 @@
 //! The packed volume: a 5-4-3 tree over bricks of 8³ voxels in flat arrays.
 //!
 //! Modules from the bottom up: [`space`] (address arithmetic), [`brick`] (voxel values), [`tree`] (the arrays
-//! and single look-ups), [`accessor`] (fast look-ups and interpolation), [`build`] (from bricks and tiles to a
-//! tree), [`channel`] (a tree in the world). Beside them: [`codec`] (bricks in fewer bytes).
+//! and single look-ups), [`accessor`] (fast look-ups and interpolation), [`build`] (from bricks and tiles to
+//! a tree), [`channel`] (a tree in the world). Beside them: [`codec`] (bricks in fewer bytes).
 //!
 //! ```
 //! use glam::{IVec3, Vec3};

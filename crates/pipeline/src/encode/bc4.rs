@@ -1,8 +1,8 @@
-//! BC4 blocks from sixteen values, also the alpha half of BC3: our own encoder, as libraries take bytes and the
-//! format resolves a seventh of a byte's step.
+//! BC4 blocks from sixteen values, also the alpha half of BC3: our own encoder, as libraries take bytes and
+//! the format resolves a seventh of a byte's step.
 //!
-//! Both kinds of palette are tried. Endpoints start at the bounds of the values; then indices and endpoints are
-//! fitted to each other in turn, endpoints by least squares.
+//! Both kinds of palette are tried. Endpoints start at the bounds of the values; then indices and endpoints
+//! are fitted to each other in turn, endpoints by least squares.
 
 use nuage_volume::codec::block::bc4::palette;
 
@@ -157,7 +157,8 @@ mod tests {
             high in 0.0f32..=1.0,
         ) {
             let values = noise.map(|noise| low + (high - low) * noise);
-            let range = values.iter().copied().fold(0.0, f32::max) - values.iter().copied().fold(1.0, f32::min);
+            let max = values.iter().copied().fold(0.0, f32::max);
+            let range = max - values.iter().copied().fold(1.0, f32::min);
             for quality in [Quality::Fast, Quality::Best] {
                 let block = encode(&values, quality);
                 let (palette, indices) = (palette([block[0], block[1]]), u64::from_le_bytes(block) >> 16);
@@ -165,7 +166,8 @@ mod tests {
                 let squares = (0..16).map(|i| (values[i] - decoded(i)) * (values[i] - decoded(i)));
                 // Half a step of the palette, and what rounding the endpoints to bytes moves it.
                 let error = (squares.sum::<f32>() / 16.0).sqrt();
-                prop_assert!(error <= range / 14.0 + 0.5 / 255.0 + 1e-6, "{quality:?}: {error}, range {range}");
+                let bound = range / 14.0 + 0.5 / 255.0 + 1e-6;
+                prop_assert!(error <= bound, "{quality:?}: {error}, range {range}");
             }
         }
 

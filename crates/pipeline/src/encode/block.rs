@@ -1,9 +1,9 @@
-//! Bricks as blocks of texture compression: the counterpart of `nuage_volume::codec::block`, which describes the
-//! layouts.
+//! Bricks as blocks of texture compression: the counterpart of `nuage_volume::codec::block`, which describes
+//! the layouts.
 //!
-//! BC4 and the alpha of BC3 are encoded here; the colours of BC3 and all of BC7 by a library: one in plain Rust,
-//! or with the feature `native-encoders` the same algorithm as vector code, several times faster. What does not
-//! live here: scaling values to 0..=1 and choosing a format.
+//! BC4 and the alpha of BC3 are encoded here; the colours of BC3 and all of BC7 by a library: one in plain
+//! Rust, or with the feature `native-encoders` the same algorithm as vector code, several times faster. What
+//! does not live here: scaling values to 0..=1 and choosing a format.
 
 use nuage_volume::codec::block::{BlockFormat, PackingAxis, voxel_offset};
 use nuage_volume::space::BRICK_VOXELS;
@@ -15,8 +15,8 @@ use super::bc4;
 pub enum Quality {
     /// The quickest that is not careless.
     Fast,
-    /// Several times slower. What the libraries can do beyond that takes four times as long again for a fifth of
-    /// a decibel.
+    /// Several times slower. What the libraries can do beyond that takes four times as long again for a fifth
+    /// of a decibel.
     Best,
 }
 
@@ -85,8 +85,8 @@ fn channel(
     })
 }
 
-/// The blocks of bricks with four channels side by side, as an image four texels high of bytes. A library that
-/// goes through it from left to right writes them in the order of the layout.
+/// The blocks of bricks with four channels side by side, as an image four texels high of bytes. A library
+/// that goes through it from left to right writes them in the order of the layout.
 struct Surface {
     texels: Vec<u8>,
     blocks: usize,
@@ -217,8 +217,8 @@ mod tests {
             axis in 0usize..3,
         ) {
             let values = smooth(wave, low, high);
-            for (format, root_mean_square, largest) in
-                [(BlockFormat::Bc4, 0.016, 0.045), (BlockFormat::Bc3, 0.04, 0.11), (BlockFormat::Bc7, 0.012, 0.07)]
+            for (format, [root_mean_square, largest]) in
+                FORMATS.into_iter().zip([[0.016, 0.045], [0.04, 0.11], [0.012, 0.07]])
             {
                 for quality in QUALITIES {
                     let [root, worst] = errors(format, AXES[axis], &values, quality);
@@ -245,7 +245,8 @@ mod tests {
                 state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
                 f32::from_bits((state >> 32) as u32)
             });
-            let clamped: [f32; BRICK_VOXELS] = values.map(|value: f32| if value.is_nan() { 0.0 } else { value.clamp(0.0, 1.0) });
+            let clamp = |value: f32| if value.is_nan() { 0.0 } else { value.clamp(0.0, 1.0) };
+            let clamped: [f32; BRICK_VOXELS] = values.map(clamp);
             for quality in QUALITIES {
                 let encode = |values| encode_brick(FORMATS[format], PackingAxis::Z, values, quality);
                 prop_assert_eq!(encode(&values), encode(&clamped));

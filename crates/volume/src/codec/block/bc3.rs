@@ -1,7 +1,7 @@
 //! BC3 blocks, four channels of sixteen texels in sixteen bytes.
 //!
-//! First alpha, a BC4 block; then two colours of 5, 6 and 5 bits and sixteen indices of two bits into the four
-//! colours on the line between them.
+//! First alpha, a BC4 block; then two colours of 5, 6 and 5 bits and sixteen indices of two bits into the
+//! four colours on the line between them.
 
 use super::bc4;
 

@@ -4,8 +4,8 @@
 
 /// The eight values that a block with these endpoints can hold.
 ///
-/// Where the first is larger, six values lie evenly between the two; where not, four do, and the last two entries
-/// are 0 and 1.
+/// Where the first is larger, six values lie evenly between the two; where not, four do, and the last two
+/// entries are 0 and 1.
 #[inline]
 pub fn palette(endpoints: [u8; 2]) -> [f32; 8] {
     let [a, b] = endpoints.map(u16::from);

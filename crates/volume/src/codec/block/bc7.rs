@@ -1,8 +1,8 @@
 //! BC7 blocks, four channels of sixteen texels in sixteen bytes.
 //!
-//! A block states one of eight modes, which says how its 128 bits are shared out: into how many subsets the texels
-//! fall, how precise the two endpoints of each subset are, and how finely indices divide the way between them. The
-//! tables are those of the Khronos Data Format Specification 1.3, section "BPTC".
+//! A block states one of eight modes, which says how its 128 bits are shared out: into how many subsets the
+//! texels fall, how precise the two endpoints of each subset are, and how finely indices divide the way
+//! between them. The tables are those of the Khronos Data Format Specification 1.3, section "BPTC".
 
 /// How a mode shares out its bits; all fields but the first count bits.
 struct Mode {
@@ -23,12 +23,15 @@ struct Mode {
 impl Mode {
     #[rustfmt::skip]
     const fn of(
-        [subsets, partition, rotation, selection, colour, alpha, endpoint_low, shared_low, index, second_index]:
-            [u32; 10],
+        [
+            subsets, partition, rotation, selection, colour, alpha, endpoint_low, shared_low, index,
+            second_index,
+        ]: [u32; 10],
     ) -> Mode {
         let subsets = subsets as usize;
         Mode {
-            subsets, partition, rotation, selection, colour, alpha, endpoint_low, shared_low, index, second_index,
+            subsets, partition, rotation, selection, colour, alpha, endpoint_low, shared_low, index,
+            second_index,
         }
     }
 }

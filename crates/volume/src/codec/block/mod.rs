@@ -1,16 +1,17 @@
 //! Bricks stored as blocks of texture compression: BC3, BC4 and BC7, which graphics hardware also decodes.
 //!
 //! A block is 4x4 texels of one slice of the brick. With the packing axis Z, texel (u, v) of a slice lies at
-//! u = x, v = y; with Y at u = x, v = z; with X at u = y, v = z. Let p be the coordinate along the packing axis.
+//! u = x, v = y; with Y at u = x, v = z; with X at u = y, v = z. Let p be the coordinate along the packing
+//! axis.
 //! - [`BlockFormat::Bc3`] and [`BlockFormat::Bc7`] have two slices; red, green, blue and alpha of a texel of
 //!   slice s are the voxels at p = 4s, 4s + 1, 4s + 2 and 4s + 3.
 //! - [`BlockFormat::Bc4`] has eight slices of one channel; slice s is p = s.
 //!
-//! Each slice is 2x2 blocks. Blocks follow each other by slice, then by v, then by u. Texel `i` of a block lies at
-//! u = `i & 3`, v = `i >> 2` from the block's corner.
+//! Each slice is 2x2 blocks. Blocks follow each other by slice, then by v, then by u. Texel `i` of a block
+//! lies at u = `i & 3`, v = `i >> 2` from the block's corner.
 //!
-//! Values are unsigned normalised numbers, 0 to 1; what they stand for is the caller's. What does not live here:
-//! encoding.
+//! Values are unsigned normalised numbers, 0 to 1; what they stand for is the caller's. What does not live
+//! here: encoding.
 
 mod bc3;
 pub mod bc4;
@@ -25,7 +26,8 @@ pub enum BlockFormat {
     Bc4,
     /// Four channels, 2 bits a voxel: three of them vary along one line per block, the fourth is free.
     Bc3,
-    /// Four channels, 2 bits a voxel, in eight modes that an encoder chooses from: better than BC3, slower to make.
+    /// Four channels, 2 bits a voxel, in eight modes that an encoder chooses from: better than BC3, slower to
+    /// make.
     Bc7,
 }
 
@@ -79,11 +81,11 @@ impl PackingAxis {
     }
 }
 
-/// The voxel offset of the first channel of a texel of a block. The next channels are the packing axis' stride
-/// apart.
+/// The voxel offset of the first channel of a texel of a block. The next channels are the packing axis'
+/// stride apart.
 ///
-/// `block` counts the blocks of a brick, `texel` the sixteen texels of a block; more than there are counts as the
-/// last.
+/// `block` counts the blocks of a brick, `texel` the sixteen texels of a block; more than there are counts as
+/// the last.
 #[inline]
 pub fn voxel_offset(format: BlockFormat, axis: PackingAxis, block: usize, texel: usize) -> usize {
     let (block, texel) = (block.min(format.slices() * 4 - 1), texel.min(15));
@@ -96,11 +98,12 @@ pub fn voxel_offset(format: BlockFormat, axis: PackingAxis, block: usize, texel:
 /// Decodes a brick. `None` if there are fewer than [`BlockFormat::brick_bytes`]; more are left alone.
 ///
 /// The values, all in f32:
-/// - BC4 and the alpha of BC3: with the endpoints a and b as integers, (w₀a + w₁b) / (255 · 7) where a > b; where
-///   not, (w₀a + w₁b) / (255 · 5), or 0, or 1. The sum is exact, the division rounds once.
-/// - The colours of BC3: endpoints of 5 and 6 bits become 8 by repeating their high bits; then a / 255, b / 255,
-///   (2a + b) / 765 or (a + 2b) / 765. The order of the endpoints does not matter.
-/// - BC7: the integers 0 to 255 that the format prescribes, divided by 255. A block of the reserved mode is 0.
+/// - BC4 and the alpha of BC3: with the endpoints a and b as integers, (w₀a + w₁b) / (255 · 7) where a > b;
+///   where not, (w₀a + w₁b) / (255 · 5), or 0, or 1. The sum is exact, the division rounds once.
+/// - The colours of BC3: endpoints of 5 and 6 bits become 8 by repeating their high bits; then a / 255, b /
+///   255, (2a + b) / 765 or (a + 2b) / 765. The order of the endpoints does not matter.
+/// - BC7: the integers 0 to 255 that the format prescribes, divided by 255. A block of the reserved mode is
+///   0.
 ///
 /// Formats: Khronos Data Format Specification 1.3, sections "S3TC", "RGTC" and "BPTC".
 pub fn decode_brick(
@@ -142,8 +145,8 @@ fn scatter<const BLOCK_BYTES: usize, const CHANNELS: usize>(
     }
 }
 
-/// One voxel of a brick: what [`decode_brick`] puts at that offset, decoding no more than its block. Offsets count
-/// modulo 512; a block that is not there is 0.
+/// One voxel of a brick: what [`decode_brick`] puts at that offset, decoding no more than its block. Offsets
+/// count modulo 512; a block that is not there is 0.
 pub fn value(format: BlockFormat, axis: PackingAxis, bytes: &[u8], offset: usize) -> f32 {
     let [u, v, p] = axis.strides().map(|stride| (offset / stride) & 7);
     let (slice, channel) = (p / format.channels(), p % format.channels());
