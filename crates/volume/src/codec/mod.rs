@@ -8,6 +8,7 @@
 //! have. Half floats in a brick count in units. Every decoded value is raised to the floor: predictions that run below it
 //! end there, which is what keeps empty voxels empty.
 
+pub mod block;
 pub mod bounds;
 pub mod codes;
 
