@@ -30,6 +30,7 @@ pub mod brick;
 pub mod build;
 pub mod channel;
 pub mod codec;
+pub mod format;
 pub mod packed;
 pub mod space;
 pub mod tree;

@@ -37,8 +37,9 @@ pub enum Codec {
         /// The bits of a code, 0 to 8.
         bits: u8,
     },
-    /// The values of another brick, its shape, scaled: a word with bias and scale, both half floats in units (the shape's
-    /// own values count as they are); the shape's offset; the tag of the shape's codec.
+    /// The values of a shape, scaled: a word with bias and scale, both half floats in units (the shape's own values count
+    /// as they are); the shape's offset in the shape store; the tag of its codec. A shape is stored as a brick is, and
+    /// is not shared itself.
     Shared,
 }
 
@@ -88,6 +89,9 @@ pub enum DecodeError {
     /// Its words are not all there.
     #[error("a brick stands outside of the brick store")]
     OutOfStore,
+    /// It stands in a page of the brick store that is not in memory.
+    #[error("a brick of a page that was not loaded")]
+    NotLoaded,
     /// Its shape is no brick, or a shared one itself.
     #[error("a shared brick without a shape")]
     NoShape,
@@ -99,8 +103,10 @@ pub enum DecodeError {
 /// What a brick needs to be decoded, besides its codec and place.
 #[derive(Debug, Clone, Copy)]
 pub struct BrickContext<'a> {
-    /// The brick store.
+    /// The brick store, or the part of it that offsets count from.
     pub words: &'a [u32],
+    /// The shape store, which [`Codec::Shared`] bricks refer to.
+    pub shapes: &'a [u32],
     /// The unit of half floats: a power of two.
     pub unit: f32,
     /// The smallest value.
@@ -217,7 +223,7 @@ impl BrickContext<'_> {
                 let line = Line::from_word(*line, self.unit)?;
                 let codec = u8::try_from(*tag).ok().and_then(Codec::from_tag);
                 let codec = codec.filter(|codec| !matches!(codec, Codec::Constant | Codec::Shared));
-                let shapes = BrickContext { unit: 1.0, ..*self };
+                let shapes = BrickContext { words: self.shapes, unit: 1.0, ..*self };
                 shapes.decode_above(codec.ok_or(DecodeError::NoShape)?, *shape, out, false)?;
                 out.iter_mut().for_each(|value| *value = line.low + line.step * *value);
             }
@@ -251,7 +257,7 @@ mod tests {
         words[5..37].fill(u32::MAX);
         // Gradient at 100: corners 0, 0, …, 255; step 1.
         (words[100], words[102]) = (HALF_ONE << 16, 255 << 24);
-        let context = BrickContext { words: &words, unit: 4.0, floor: 0.0 };
+        let context = BrickContext { words: &words, shapes: &[], unit: 4.0, floor: 0.0 };
         let mut out = [0.0; BRICK_VOXELS];
         context.decode(Codec::Uniform { bits: 2 }, 4, &mut out).unwrap();
         assert_eq!(out, [4.0 + 8.0 * 3.0; BRICK_VOXELS]);
@@ -259,10 +265,10 @@ mod tests {
         assert_eq!((out[0], out[7], out[511]), (0.0, 0.0, 1020.0));
         let expected = 1020.0 * (3.0 / 7.0) * (5.0 / 7.0) * (6.0 / 7.0);
         assert!((out[3 << 6 | 5 << 3 | 6] - expected).abs() < 1e-3);
-        // A shared brick at 200 of the first, in units of 1: 28 becomes 1 + 7 × 0.5, in units of 4.
-        words[200..203].copy_from_slice(&[HALF_ONE | 0x3800 << 16, 4, 2]);
-        let context = BrickContext { words: &words, unit: 4.0, floor: 0.0 };
-        context.decode(Codec::Shared, 200, &mut out).unwrap();
+        // A shared brick of the first, now at 2 among the shapes, in units of 1: 28 becomes 1 + 7 × 0.5, in units of 4.
+        let shared = [HALF_ONE | 0x3800 << 16, 2, 2];
+        let context = BrickContext { words: &shared, shapes: &words[2..37], unit: 4.0, floor: 0.0 };
+        context.decode(Codec::Shared, 0, &mut out).unwrap();
         assert_eq!(out, [4.0 + 2.0 * 7.0; BRICK_VOXELS]);
     }
 
@@ -271,7 +277,7 @@ mod tests {
         let words = [0xbc00, 0, 0].map(|word: u32| word);
         let mut out = [1.0; BRICK_VOXELS];
         for (floor, expected) in [(0.0, 0.0), (-0.5, -0.5), (f32::MIN, -1.0)] {
-            let context = BrickContext { words: &words, unit: 1.0, floor };
+            let context = BrickContext { words: &words, shapes: &words, unit: 1.0, floor };
             context.decode(Codec::Gradient { bits: 0 }, 0, &mut out).unwrap();
             assert_eq!(out, [expected; BRICK_VOXELS]);
         }
@@ -283,7 +289,7 @@ mod tests {
         words[1] = 0x7c00;
         words[2] = 0x7e00 << 16;
         words[3..6].copy_from_slice(&[0, 0, 11]);
-        let context = BrickContext { words: &words, unit: 1.0, floor: 0.0 };
+        let context = BrickContext { words: &words, shapes: &words, unit: 1.0, floor: 0.0 };
         let mut out = [0.0; BRICK_VOXELS];
         let mut decode = |codec, offset| context.decode(codec, offset, &mut out);
         assert_eq!(decode(Codec::F32, 100), Err(DecodeError::OutOfStore));

@@ -6,12 +6,13 @@
 //! that a frame that repeats another costs its root. What has no entry is background everywhere, trilinear samples
 //! included: regions that are background themselves but touch others have an entry.
 //!
-//! [`mask`] is how the slots of a node are stored; [`check`] makes sure of arrays that come from a file. Codecs live in
+//! [`mask`] is how the slots of a node are stored, [`store`] where the words of bricks stand; [`check`] makes sure of arrays that come from a file. Codecs live in
 //! [`crate::codec`].
 
 pub mod build;
 pub mod check;
 pub mod mask;
+pub mod store;
 
 use bytemuck::{Pod, Zeroable};
 use glam::IVec3;
@@ -114,7 +115,7 @@ pub struct Trees {
 }
 
 /// One tree among [`Trees`].
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct TreeRef {
     /// The index of its first root cell.
     pub first_cell: u32,

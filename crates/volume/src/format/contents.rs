@@ -1,0 +1,169 @@
+//! What an asset holds, apart from trees and bricks: channels, frames, and what is known of their sources.
+
+use serde::{Deserialize, Deserializer, Serialize};
+
+use crate::packed::TreeRef;
+
+/// All of an asset's channels and frames.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Contents {
+    /// Frames per second, if known.
+    pub frame_rate: Option<f64>,
+    /// The channels, which grids refer to by their index.
+    pub channels: Vec<ChannelInfo>,
+    /// The frames in order.
+    pub frames: Vec<Frame>,
+}
+
+/// What the values of a channel are, and how exact.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ChannelInfo {
+    /// The name of the source's grid.
+    pub name: String,
+    /// Which component of a vector grid it is: 0, 1 or 2.
+    pub component: Option<u8>,
+    /// What the values mean.
+    pub role: Role,
+    /// The unit that the values are measured in, such as `K`; empty if unknown.
+    pub physical_unit: String,
+    /// The codecs' unit: a power of two, not less than any magnitude.
+    pub unit: f32,
+    /// The smallest value: decoded values are raised to it.
+    pub floor: f32,
+    /// The largest value.
+    pub peak: f32,
+    /// How far decoded values are from the source's, as measured.
+    pub quality: Quality,
+    /// The largest error that was asked for.
+    pub asked_max_error: Option<f32>,
+    /// The ratio of peak to noise that was asked for, in decibels.
+    pub asked_psnr: Option<f64>,
+}
+
+/// What the values of a channel mean.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize)]
+pub enum Role {
+    /// How much there is.
+    Density,
+    /// How hot it is.
+    Temperature,
+    /// How much burns.
+    Flame,
+    /// How fast it moves.
+    Velocity,
+    /// The distance to a surface, negative inside.
+    SignedDistance,
+    /// A colour.
+    Colour,
+    /// Anything else, and what later versions may know.
+    Other,
+}
+
+impl<'de> Deserialize<'de> for Role {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Role, D::Error> {
+        Ok(match String::deserialize(deserializer)?.as_str() {
+            "Density" => Role::Density,
+            "Temperature" => Role::Temperature,
+            "Flame" => Role::Flame,
+            "Velocity" => Role::Velocity,
+            "SignedDistance" => Role::SignedDistance,
+            "Colour" => Role::Colour,
+            _ => Role::Other,
+        })
+    }
+}
+
+/// Errors, measured over all frames.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct Quality {
+    /// The largest difference.
+    pub max_error: f32,
+    /// The sum of all squared differences.
+    pub squared_error: f64,
+    /// How many voxels were compared.
+    pub voxels: u64,
+}
+
+/// A moment.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Frame {
+    /// Its number in the source's sequence, if it had one.
+    pub number: Option<i64>,
+    /// The name of its source.
+    pub name: String,
+    /// Its grids.
+    pub grids: Vec<FrameGrid>,
+}
+
+/// One channel at one moment.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct FrameGrid {
+    /// The index of the channel.
+    pub channel: u32,
+    /// The trees of all levels of detail, finest first; a level has half the voxels per axis of that before.
+    pub levels: Vec<TreeRef>,
+    /// What is added to a stored index for the source's.
+    pub index_offset: [i32; 3],
+    /// The first and the last active voxel along each axis in the source's indices. None if nothing is active.
+    pub active_box: Option<[[i32; 3]; 2]>,
+    /// From the source's indices to the world: the columns for x, y and z, then the translation. None if that is not
+    /// linear.
+    pub world_from_index: Option<[f64; 12]>,
+    /// What is needed to write the source's kind of file again; only its writer knows more of it.
+    #[serde(skip)]
+    pub source_header: Vec<u8>,
+}
+
+impl Contents {
+    /// All grids of all frames in order.
+    pub fn grids(&self) -> impl Iterator<Item = &FrameGrid> {
+        self.frames.iter().flat_map(|frame| &frame.grids)
+    }
+
+    /// The memory taken, roughly.
+    pub fn memory_bytes(&self) -> usize {
+        let grid = |grid: &FrameGrid| {
+            size_of::<FrameGrid>() + size_of_val(grid.levels.as_slice()) + grid.source_header.len()
+        };
+        let frames = self.frames.iter().map(|frame| size_of::<Frame>() + frame.name.len()).sum::<usize>();
+        let channels =
+            self.channels.iter().map(|it| size_of::<ChannelInfo>() + it.name.len() + it.physical_unit.len());
+        frames + channels.sum::<usize>() + self.grids().map(grid).sum::<usize>()
+    }
+
+    /// What cannot be, in words, of numbers alone.
+    pub(super) fn fault(&self) -> Option<String> {
+        for channel in &self.channels {
+            let is_power = channel.unit.is_normal() && channel.unit > 0.0 && channel.unit.to_bits() << 9 == 0;
+            let floats = [channel.floor, channel.peak, channel.quality.max_error];
+            let doubles = [Some(channel.quality.squared_error), channel.asked_psnr];
+            let asked = channel.asked_max_error.is_none_or(f32::is_finite);
+            if !is_power {
+                return Some(format!("channel {:?} has a unit that is no power of two", channel.name));
+            }
+            if !floats.into_iter().all(f32::is_finite)
+                || !doubles.into_iter().flatten().all(f64::is_finite)
+                || !asked
+            {
+                return Some(format!("channel {:?} has a number that is not finite", channel.name));
+            }
+            if channel.component.is_some_and(|component| component > 2) {
+                return Some(format!("channel {:?} is a component beyond the third", channel.name));
+            }
+        }
+        if !self.frame_rate.is_none_or(f64::is_finite) {
+            return Some("a frame rate that is not finite".to_owned());
+        }
+        for grid in self.grids() {
+            if grid.channel as usize >= self.channels.len() {
+                return Some(format!("a grid of channel {}, of {}", grid.channel, self.channels.len()));
+            }
+            let transform = grid.world_from_index.iter().flatten();
+            let backgrounds = grid.levels.iter().all(|level| level.background.is_finite());
+            if !backgrounds || !transform.copied().all(f64::is_finite) {
+                return Some("a grid with a number that is not finite".to_owned());
+            }
+        }
+        None
+    }
+}

@@ -1,0 +1,28 @@
+//! The file format of packed volumes, `.nuage`: contents, trees and bricks in checked, compressed chunks.
+//!
+//! From the bottom up: [`source`] (where bytes come from), `layout` (header, table of contents, one chunk), `predict` and
+//! `page` (the words of bricks), `arrays` (those of trees), [`contents`] (channels and frames), [`mod@read`] and
+//! [`mod@write`]. The specification is `docs/format.md`.
+//!
+//! What does not live here: files on disk, the encoder of Zstandard, and how bricks are encoded.
+
+mod arrays;
+mod check;
+pub mod contents;
+mod error;
+mod layout;
+mod page;
+mod predict;
+pub mod read;
+pub mod source;
+pub mod write;
+
+pub use contents::{ChannelInfo, Contents, Frame, FrameGrid, Quality, Role};
+pub use error::{FormatError, Limits};
+pub use layout::Kind;
+pub use read::{Asset, MemoryBytes};
+pub use source::ReadAt;
+pub use write::{Summary, Writer, write};
+
+#[cfg(test)]
+mod tests;
