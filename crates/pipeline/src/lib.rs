@@ -1,14 +1,15 @@
 //! From sources to volumes: what an OpenVDB grid means as a medium, and how sequences lie on disk.
 //!
 //! [`import`] turns a decoded grid into a channel of the packed volume; [`select`] finds the grid that a user
-//! means; with the feature `fs`, [`sequence`] turns `smoke.####.vdb` into frames and [`output`] writes files
-//! that appear whole or not at all.
+//! means; [`cluster`] finds bricks that can share their values; with the feature `fs`, [`sequence`] turns
+//! `smoke.####.vdb` into frames and [`output`] writes files that appear whole or not at all.
 //!
 //! What does not live here: decoding of .vdb bytes (crate `nuage-vdb`), the volume itself (`nuage-volume`),
 //! lights, cameras and pictures (`nuage-render`).
 
 #![forbid(unsafe_code)]
 
+pub mod cluster;
 pub mod import;
 #[cfg(feature = "fs")]
 pub mod output;
