@@ -5,7 +5,8 @@
 //! they are made up, like smoke. Plain k-means, fast k-means and shared shapes run over the same bricks, the
 //! latter with the bound on the error at which it leaves no more bytes than k-means does. Plain k-means runs over
 //! every tenth brick unless `--plain` is given. Other options: `--clusters`, `--iterations`, `--threshold`,
-//! `--rule 4.5` or `5.3`, and `--seed`, each with a number.
+//! `--rule 4.5` or `5.3`, `--seed`, and `--peak`, how many times the root of the mean squared error the largest error
+//! of a shared brick may be, each with a number.
 
 #![allow(clippy::print_stdout, reason = "the lines printed are what the program is for")]
 
@@ -32,6 +33,8 @@ struct Options {
     threshold: f32,
     rejection: Rejection,
     seed: u64,
+    /// The bound on the largest error over that on the root of the mean squared error.
+    peak: f32,
     files: Vec<String>,
 }
 
@@ -44,6 +47,7 @@ fn options() -> Result<Options, Box<dyn Error>> {
         threshold: 0.01,
         rejection: Rejection::VarianceOverMean,
         seed: 1,
+        peak: 1.0,
         files: Vec::new(),
     };
     let mut arguments = std::env::args().skip(1);
@@ -56,6 +60,7 @@ fn options() -> Result<Options, Box<dyn Error>> {
             "--iterations" => options.iterations = next()?.parse()?,
             "--threshold" => options.threshold = next()?.parse()?,
             "--seed" => options.seed = next()?.parse()?,
+            "--peak" => options.peak = next()?.parse()?,
             "--rule" => {
                 options.rejection = match next()?.as_str() {
                     "4.5" => Rejection::NormalizedVariance,
@@ -124,7 +129,7 @@ fn bricks(options: &Options) -> Result<Vec<Brick>, Box<dyn Error>> {
     Ok(bricks)
 }
 
-/// The mean and the largest error of all voxels, kept ones included.
+/// The root of the mean squared and the largest error of all voxels, kept ones included.
 fn error(bricks: &[Brick], again: impl Fn(usize) -> Option<Brick>) -> (f64, f32) {
     let (mut squares, mut largest) = (0.0, 0f32);
     for (i, brick) in bricks.iter().enumerate() {
@@ -168,14 +173,14 @@ fn shapes_bytes(found: &shapes::Shapes) -> usize {
 }
 
 /// The smallest bound on the error at which sharing leaves no more of the bricks than `share_left`.
-fn search_bound(bricks: &[Brick], settings: shapes::Settings, share_left: f64) -> f32 {
+fn search_bound(bricks: &[Brick], settings: impl Fn(f32) -> shapes::Settings, share_left: f64) -> f32 {
     let step = bricks.len().div_ceil(SEARCH_BRICKS);
     let few: Vec<Brick> = bricks.iter().step_by(step).copied().collect();
     let wanted = share_left * (few.len() * BRICK_BYTES) as f64;
     let (mut low, mut high) = (1e-6f32, 10f32);
     for _ in 0..16 {
         let middle = (low * high).sqrt();
-        let found = shapes::share(&few, &shapes::Settings { max_error: middle, ..settings });
+        let found = shapes::share(&few, &settings(middle));
         if shapes_bytes(&found) as f64 <= wanted { high = middle } else { low = middle }
     }
     high
@@ -232,16 +237,13 @@ fn main() -> Result<(), Box<dyn Error>> {
 
     let left = bytes_left(bricks.len() - taking_part.len(), clusters.centres.len(), 0, 0) as f64
         / (bricks.len() * BRICK_BYTES) as f64;
-    let settings = shapes::Settings {
-        shapes: options.clusters,
-        iterations,
-        max_error: 0.0,
-        max_mse: f32::INFINITY,
-        seed,
+    let settings = |max_error: f32| {
+        let max_mse = (max_error / options.peak).powi(2);
+        shapes::Settings { shapes: options.clusters, iterations, max_error, max_mse, seed }
     };
     let max_error = search_bound(&bricks, settings, left);
     let begin = Instant::now();
-    let found = shapes::share(&bricks, &shapes::Settings { max_error, ..settings });
+    let found = shapes::share(&bricks, &settings(max_error));
     println!(
         "shapes         secs={:.3} bound={max_error:.5} (the bound was searched for)",
         begin.elapsed().as_secs_f64()
