@@ -4,7 +4,9 @@
 //! shares only where that meets the caller's bounds on its error, checked in full; else it is kept. Shapes are
 //! found among a few low frequencies of a sample of the bricks, where comparing is cheap: first a greedy cover of
 //! the sample, then rounds of k-means over lines through the origin, as scale may be of any size and sign.
-//! Bricks with much fine detail are kept, even copies of one another. What does not live here: clustering without scale and bias, which is in [`thesis`](super::thesis).
+//! Bricks with much fine detail are kept, even copies of one another.
+//!
+//! What does not live here: clustering without scale and bias, which is in [`thesis`](super::thesis).
 
 use std::collections::BinaryHeap;
 
