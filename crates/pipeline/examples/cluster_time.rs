@@ -1,12 +1,12 @@
 //! Times clustering and says what it costs in error:
 //! `cargo run --release -p nuage-pipeline --example cluster_time -- [OPTIONS] [FILE...]`.
 //!
-//! The bricks are those of the density in the files, repeated with small variations up to `--bricks`; without files
-//! they are made up, like smoke. Plain k-means, fast k-means and shared shapes run over the same bricks, the
-//! latter with the bound on the error at which it leaves no more bytes than k-means does. Plain k-means runs over
-//! every tenth brick unless `--plain` is given. Other options: `--clusters`, `--iterations`, `--threshold`,
-//! `--rule 4.5` or `5.3`, `--seed`, and `--peak`, how many times the root of the mean squared error the largest error
-//! of a shared brick may be, each with a number.
+//! The bricks are those of the density in the files, repeated with small variations up to `--bricks`; without
+//! files they are made up, like smoke. Plain k-means, fast k-means and shared shapes run over the same
+//! bricks, the latter with the bound on the error at which it leaves no more bytes than k-means does. Plain
+//! k-means runs over every tenth brick unless `--plain` is given. Other options: `--clusters`,
+//! `--iterations`, `--threshold`, `--rule 4.5` or `5.3`, `--seed`, and `--peak`, how many times the root of
+//! the mean squared error the largest error of a shared brick may be, each with a number.
 
 #![allow(clippy::print_stdout, reason = "the lines printed are what the program is for")]
 
@@ -19,7 +19,8 @@ use nuage_pipeline::import::import;
 use nuage_vdb::File;
 use nuage_volume::brick::Bricks;
 
-/// Own scale and bias of a brick. The index of its shape or centre takes no more room than that of a kept brick.
+/// Own scale and bias of a brick. The index of its shape or centre takes no more room than that of a kept
+/// brick.
 const OWN_BYTES: usize = 8;
 const BRICK_BYTES: usize = size_of::<Brick>();
 /// How many bricks the bound on the error is searched with.

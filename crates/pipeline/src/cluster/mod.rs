@@ -1,8 +1,8 @@
 //! Bricks that are alike, so that fewer of them need be kept: lossy, and only on request.
 //!
-//! [`thesis`] replaces nearly homogeneous bricks by the centres of k-means; [`shapes`] lets bricks share a shape
-//! and gives each its own scale and bias, within a bound on the error. Both are pure functions on bricks. What
-//! does not live here: how shared bricks are stored in a volume, and when to share them.
+//! [`thesis`] replaces nearly homogeneous bricks by the centres of k-means; [`shapes`] lets bricks share a
+//! shape and gives each its own scale and bias, within a bound on the error. Both are pure functions on
+//! bricks. What does not live here: how shared bricks are stored in a volume, and when to share them.
 
 pub mod shapes;
 pub mod thesis;
@@ -12,8 +12,8 @@ use nuage_volume::space::BRICK_VOXELS;
 /// The values of 8³ voxels.
 pub type Brick = [f32; BRICK_VOXELS];
 
-/// Bricks with larger values than this, or with values that are not numbers, are kept as they are: sums of squares
-/// of theirs would leave the range of f32.
+/// Bricks with larger values than this, or with values that are not numbers, are kept as they are: sums of
+/// squares of theirs would leave the range of f32.
 pub const MAX_MAGNITUDE: f32 = 1e15;
 
 /// How many sums run side by side, so that the loops become vector instructions.
@@ -41,15 +41,15 @@ fn mean(brick: &Brick) -> f32 {
     sum(brick, brick, |value, _| value) / BRICK_VOXELS as f32
 }
 
-/// The values less their mean, and the mean. The mean is what rounding left of it; the values that are given are
-/// centred on the number that is given.
+/// The values less their mean, and the mean. The mean is what rounding left of it; the values that are given
+/// are centred on the number that is given.
 fn centred(brick: &Brick) -> (Brick, f32) {
     let mean = mean(brick);
     (brick.map(|value| value - mean), mean)
 }
 
-/// A number that looks random: the same for the same seed and counter. The finalizer of SplitMix64 (Steele, Lea,
-/// Flood: Fast Splittable Pseudorandom Number Generators, 2014).
+/// A number that looks random: the same for the same seed and counter. The finalizer of SplitMix64 (Steele,
+/// Lea, Flood: Fast Splittable Pseudorandom Number Generators, 2014).
 fn random(seed: u64, counter: u64) -> u64 {
     let mut bits = seed.wrapping_add(counter.wrapping_add(1).wrapping_mul(0x9e37_79b9_7f4a_7c15));
     bits = (bits ^ bits >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -69,8 +69,8 @@ fn choose(from: &[usize], count: usize, seed: u64) -> Vec<usize> {
     items
 }
 
-/// What `make` gives for 0 to `count`, in this order, in parallel where the feature is on. Each thread has working
-/// memory of its own.
+/// What `make` gives for 0 to `count`, in this order, in parallel where the feature is on. Each thread has
+/// working memory of its own.
 fn map<S, T: Send>(
     count: usize,
     memory: impl Fn() -> S + Sync + Send,

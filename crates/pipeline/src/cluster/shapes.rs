@@ -1,10 +1,10 @@
 //! Shared shapes: a brick is `bias + scale * shape`, the shape one of a few that many bricks share.
 //!
-//! Own scale and bias let gradients and faint copies of one another share, which centres of k-means cannot. A brick
-//! shares only where that meets the caller's bounds on its error, checked in full; else it is kept. Shapes are
-//! found among a few low frequencies of a sample of the bricks, where comparing is cheap: first a greedy cover of
-//! the sample, then rounds of k-means over lines through the origin, as scale may be of any size and sign.
-//! Bricks with much fine detail are kept, even copies of one another.
+//! Own scale and bias let gradients and faint copies of one another share, which centres of k-means cannot. A
+//! brick shares only where that meets the caller's bounds on its error, checked in full; else it is kept.
+//! Shapes are found among a few low frequencies of a sample of the bricks, where comparing is cheap: first a
+//! greedy cover of the sample, then rounds of k-means over lines through the origin, as scale may be of any
+//! size and sign. Bricks with much fine detail are kept, even copies of one another.
 //!
 //! What does not live here: clustering without scale and bias, which is in [`thesis`](super::thesis).
 
@@ -68,8 +68,9 @@ const COVER_SAMPLE: usize = 4096;
 const FIT_SAMPLE: usize = 1 << 16;
 /// How many of the likeliest shapes of a brick are checked in full.
 const CHECKED: usize = 8;
-/// How many times the root of the mean squared error the largest one is in a brick that fails by little. In noise it
-/// would be 3; in clouds the largest errors stand at edges. Of 3 to 8, 5 left the lowest bound at equal size.
+/// How many times the root of the mean squared error the largest one is in a brick that fails by little. In
+/// noise it would be 3; in clouds the largest errors stand at edges. Of 3 to 8, 5 left the lowest bound at
+/// equal size.
 const PEAK: f32 = 5.0;
 
 /// What is known of a brick.
@@ -191,8 +192,8 @@ fn unit(spectrum: &Spectrum) -> Option<Spectrum> {
     (length > 0.0 && length < f32::INFINITY).then(|| spectrum.map(|value| value / length))
 }
 
-/// Picks spectra out of a sample, each time the one that describes the most bricks not yet described within the
-/// target: at most `count`, and none that describes itself alone.
+/// Picks spectra out of a sample, each time the one that describes the most bricks not yet described within
+/// the target: at most `count`, and none that describes itself alone.
 fn cover(features: &[Features], sample: &[usize], count: usize, target: f32) -> Vec<Spectrum> {
     let candidates: Vec<(Spectrum, usize)> =
         sample.iter().take(COVER_SAMPLE).filter_map(|i| Some((unit(&features[*i].spectrum)?, *i))).collect();
@@ -242,8 +243,8 @@ fn cover(features: &[Features], sample: &[usize], count: usize, target: f32) -> 
     picked
 }
 
-/// The line nearest to each brick, with the brick's signed length along it. Bricks that are far from all are left
-/// out: they will be kept, and would only draw shapes away from those that can share.
+/// The line nearest to each brick, with the brick's signed length along it. Bricks that are far from all are
+/// left out: they will be kept, and would only draw shapes away from those that can share.
 fn nearest_lines(
     features: &[Features],
     sample: &[usize],
@@ -362,8 +363,8 @@ fn assign(
                     }
                 }
             }
-            // What a shape leaves of the whole energy: all that it does not describe among the low frequencies, if the
-            // rest fits as well as it can.
+            // What a shape leaves of the whole energy: all that it does not describe among the low
+            // frequencies, if the rest fits as well as it can.
             let rest = (energy - dot(spectrum, spectrum)).max(0.0);
             let can_fit = |along: f32| energy - (along + rest.sqrt()).powi(2) <= limit;
             let flat = (*energy <= limit).then_some((0.0, 0));

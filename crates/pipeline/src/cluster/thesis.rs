@@ -1,9 +1,10 @@
-//! Clustering by k-means, as in a master's thesis on rendering VDB files (sections 4.5 and 5.3): bricks of low
-//! variance are replaced by the nearest of k centres under the normalised Manhattan distance, others are kept.
+//! Clustering by k-means, as in a master's thesis on rendering VDB files (sections 4.5 and 5.3): bricks of
+//! low variance are replaced by the nearest of k centres under the normalised Manhattan distance, others are
+//! kept.
 //!
 //! [`k_means`] passes over most centres by lower bounds of their distance; [`plain_k_means`] is the same in
-//! textbook loops, to test and to measure against. What does not live here: sharing with scale and bias, which is
-//! in [`shapes`](super::shapes).
+//! textbook loops, to test and to measure against. What does not live here: sharing with scale and bias,
+//! which is in [`shapes`](super::shapes).
 
 use super::{BRICK_VOXELS, Brick, choose, is_tame, map, mean, sum};
 
@@ -17,8 +18,8 @@ pub enum Rejection {
 }
 
 impl Rejection {
-    /// How varied a brick is; infinite where it is varied about a mean of zero, or holds numbers that are none or
-    /// too large ([`MAX_MAGNITUDE`](super::MAX_MAGNITUDE)).
+    /// How varied a brick is; infinite where it is varied about a mean of zero, or holds numbers that are
+    /// none or too large ([`MAX_MAGNITUDE`](super::MAX_MAGNITUDE)).
     pub fn measure(self, brick: &Brick) -> f32 {
         if !is_tame(brick) {
             return f32::INFINITY;
@@ -111,8 +112,8 @@ pub fn cluster(bricks: &[Brick], settings: &Settings) -> Clusters {
     Clusters { centres, of_brick }
 }
 
-/// Moves centres into the middle of the bricks nearest to them, again and again until no brick changes its centre.
-/// Takes part of `bricks` those whose indices are given, which must have no values over
+/// Moves centres into the middle of the bricks nearest to them, again and again until no brick changes its
+/// centre. Takes part of `bricks` those whose indices are given, which must have no values over
 /// [`MAX_MAGNITUDE`](super::MAX_MAGNITUDE). A centre that is nearest to none stays.
 ///
 /// # Panics
@@ -142,8 +143,8 @@ fn assign(bricks: &[Brick], taking_part: &[usize], centres: &[Brick], before: Op
     map(taking_part.len(), || vec![0.0; centres.len()], search)
 }
 
-/// Sums over 4³ blocks of 2³ voxels and over 2³ blocks of 4³ voxels. Their Manhattan distance is at most that of the
-/// voxels, as the absolute value of a sum is at most the sum of the absolute values.
+/// Sums over 4³ blocks of 2³ voxels and over 2³ blocks of 4³ voxels. Their Manhattan distance is at most that
+/// of the voxels, as the absolute value of a sum is at most the sum of the absolute values.
 struct BlockSums {
     fine: [f32; 64],
     coarse: [f32; 8],
