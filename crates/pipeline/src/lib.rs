@@ -1,14 +1,16 @@
 //! From sources to volumes: what an OpenVDB grid means as a medium, and how sequences lie on disk.
 //!
 //! [`import`] turns a decoded grid into a channel of the packed volume; [`select`] finds the grid that a user
-//! means; [`encode`] puts bricks into fewer bytes; with the feature `fs`, [`sequence`] turns `smoke.####.vdb`
-//! into frames and [`output`] writes files that appear whole or not at all.
+//! means; [`encode`] puts bricks into fewer bytes, [`cluster`] finds those that can share their values, and `pack`
+//! makes packed volumes of frames; with the feature `fs`, [`sequence`] turns `smoke.####.vdb` into frames and
+//! [`output`] writes files that appear whole or not at all.
 //!
 //! What does not live here: decoding of .vdb bytes (crate `nuage-vdb`), the volume itself (`nuage-volume`),
 //! lights, cameras and pictures (`nuage-render`).
 
 #![forbid(unsafe_code)]
 
+pub mod cluster;
 pub mod encode;
 pub mod import;
 #[cfg(feature = "fs")]
