@@ -8,16 +8,24 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use nuage_pipeline::output::write_whole;
+use nuage_pipeline::pack::frame::{Bound, Options};
+use nuage_pipeline::sequence::{FrameFile, output_path};
 use nuage_vdb::{AnyFile, AnyTree, Compression, Grid, IndexBox, Metadata, WriteOptions, nano};
+use nuage_volume::codec::Codec;
+use nuage_volume::codec::block::{BlockFormat, PackingAxis};
 
 use crate::error::{Failure, explain};
+use crate::frames;
+use crate::pack::{self, PackArgs};
 use crate::source::{DiskFile, Memory};
 use crate::text::{number, one_line, thousands};
 
-/// Write grids of VDB and NanoVDB files to another file, chosen, renamed, cut or compressed otherwise.
+/// Write grids of VDB and NanoVDB files to another file, chosen, renamed, cut or compressed otherwise; or a whole
+/// sequence to one packed file, and back.
 ///
-/// The name of the output says what it is: .vdb or .nvdb. Of several inputs the grids are put together in order. An
-/// output appears whole or not at all.
+/// The name of the output says what it is: .vdb, .nvdb or .nuage. Of several inputs the grids are put together in order;
+/// a sequence, written smoke.####.vdb, smoke.%04d.vdb or as a glob in quotes, becomes one .nuage file, or files with
+/// names of the same kind. An output appears whole or not at all.
 #[derive(clap::Args)]
 pub(crate) struct Args {
     /// The files to read, and last the file to write
@@ -67,17 +75,23 @@ pub(crate) struct Args {
     #[arg(long, value_enum)]
     encoding: Option<NanoEncoding>,
 
-    /// The largest error that --encoding fpn may make
-    #[arg(long, value_name = "X", required_if_eq("encoding", "fpn"))]
-    max_error: Option<f32>,
+    /// The largest error of any voxel, in .nuage files and with --encoding fpn: a number, or for .nuage files a
+    /// part of a channel's peak, as in 3%
+    #[arg(long, value_name = "X", required_if_eq("encoding", "fpn"), value_parser = pack::bound)]
+    max_error: Option<Bound>,
 
-    /// How .nvdb files are compressed [default: none]
-    #[arg(long, value_enum)]
-    codec: Option<NanoCodec>,
+    /// How .nvdb files are compressed: none, zip or blosc [default: none]; the codec of all bricks in .nuage files that
+    /// it can hold: u1 to u8 (uniform codes of so many bits), g0 to g8 (the same around a gradient), f16, f32, or the
+    /// texture blocks bc3, bc4 and bc7
+    #[arg(long, value_name = "CODEC", value_parser = codec)]
+    codec: Option<CodecChoice>,
+
+    #[command(flatten)]
+    pub(crate) pack: PackArgs,
 
     /// Replace outputs that are there
     #[arg(long)]
-    force: bool,
+    pub(crate) force: bool,
 
     #[command(flatten)]
     memory: Memory,
@@ -99,17 +113,39 @@ enum NanoEncoding {
     Fpn,
 }
 
-#[derive(Clone, Copy, clap::ValueEnum)]
-enum NanoCodec {
-    None,
-    Zip,
-    Blosc,
+/// What `--codec` names.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum CodecChoice {
+    Nano(nano::Codec),
+    Packed(Codec),
+}
+
+fn codec(text: &str) -> Result<CodecChoice, String> {
+    let packed = |codec| Ok(CodecChoice::Packed(codec));
+    let bits = text.get(1..).and_then(|digits| digits.parse::<u8>().ok());
+    match (text, bits) {
+        ("none", _) => Ok(CodecChoice::Nano(nano::Codec::None)),
+        ("zip", _) => Ok(CodecChoice::Nano(nano::Codec::Zip)),
+        ("blosc", _) => Ok(CodecChoice::Nano(nano::Codec::Blosc)),
+        ("f16", _) => packed(Codec::F16),
+        ("f32", _) => packed(Codec::F32),
+        ("bc3", _) => packed(Codec::Block { format: BlockFormat::Bc3, axis: PackingAxis::Z }),
+        ("bc4", _) => packed(Codec::Block { format: BlockFormat::Bc4, axis: PackingAxis::Z }),
+        ("bc7", _) => packed(Codec::Block { format: BlockFormat::Bc7, axis: PackingAxis::Z }),
+        (text, Some(bits @ 1..=8)) if text.starts_with('u') => packed(Codec::Uniform { bits }),
+        (text, Some(bits @ 0..=8)) if text.starts_with('g') => packed(Codec::Gradient { bits }),
+        _ => Err(
+            "there are none, zip, blosc for .nvdb and u1 to u8, g0 to g8, f16, f32, bc3, bc4, bc7 for .nuage"
+                .into(),
+        ),
+    }
 }
 
 /// What is written, and how.
 enum Target {
     Vdb(WriteOptions),
     Nano(nano::WriteOptions),
+    Packed(Options),
 }
 
 fn rename(text: &str) -> Result<(String, String), String> {
@@ -132,9 +168,57 @@ fn six<T: std::str::FromStr>(text: &str) -> Result<[T; 6], String> {
 /// # Errors
 /// If an input cannot be read, an output cannot be written or is there already, or the options make no sense.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
-    let start = Instant::now();
     let Some((output, inputs)) = args.files.split_last() else { return Ok(()) };
     let target = target(args, output)?;
+    let frames = inputs.iter().map(|input| frames::find(input, args.pack.frames.as_ref()));
+    let frames: Vec<Vec<FrameFile>> = frames.collect::<Result<_, _>>()?;
+    let is_sequence = frames.iter().any(|frames| frames.len() > 1);
+    // Of one input, every frame becomes a file; single files that are several become one.
+    let is_pattern = is_sequence || inputs.len() == 1;
+    match target {
+        Target::Packed(_) if args.split => {
+            Err(Failure::Usage("--split is for outputs with the extension .vdb or .nvdb".into()))
+        }
+        Target::Packed(options) => {
+            check_absent(output, args.force)?;
+            pack::run(args, &frames.concat(), &options, output)
+        }
+        target if is_pattern => {
+            for frame in frames.concat() {
+                let pattern = output.to_string_lossy();
+                let output = output_path(&pattern, frame.frame, is_sequence)
+                    .map_err(|error| Failure::file(output, error.to_string()))?;
+                convert(args, &[frame.path], &output, &target)?;
+            }
+            Ok(())
+        }
+        target => {
+            let inputs: Vec<PathBuf> = frames.into_iter().flatten().map(|frame| frame.path).collect();
+            convert(args, &inputs, output, &target)
+        }
+    }
+}
+
+/// Reads the grids of one frame, as they were asked for.
+pub(crate) fn load(args: &Args, path: &Path) -> Result<(Vec<Grid>, Metadata), Failure> {
+    let disk = DiskFile::open(path)?;
+    let file = disk.any(args.memory)?;
+    let asked = args.grid.iter().chain(args.rename.iter().map(|(old, _)| old));
+    if let Some(name) = asked.into_iter().find(|name| file.find(name).is_none()) {
+        return Err(Failure::file(path, not_found(name, &file.names())));
+    }
+    let mut grids = Vec::new();
+    read(&disk, &file, args, &mut grids)?;
+    Ok((grids, file.metadata()))
+}
+
+fn not_found(name: &str, names: &[impl std::borrow::Borrow<str>]) -> String {
+    format!("grid '{name}' not found; there are: {}", names.join(", "))
+}
+
+/// Converts files to one.
+fn convert(args: &Args, inputs: &[PathBuf], output: &PathBuf, target: &Target) -> Result<(), Failure> {
+    let start = Instant::now();
     if !args.split {
         check_absent(output, args.force)?;
     }
@@ -157,8 +241,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         read(&disk, &file, args, &mut grids)?;
     }
     if let Some(name) = missing.first() {
-        let what = format!("grid '{name}' not found; there are: {}", names.join(", "));
-        return Err(Failure::file(inputs.first().unwrap_or(output), what));
+        return Err(Failure::file(inputs.first().unwrap_or(output), not_found(name, &names)));
     }
     let outputs = match args.split {
         false => vec![(output.clone(), grids)],
@@ -170,9 +253,10 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let mut out = io::stdout().lock();
     for (path, grids) in &outputs {
         let mut bytes = Vec::new();
-        let written = match &target {
+        let written = match target {
             Target::Vdb(options) => nuage_vdb::write(grids, &metadata, options, &mut bytes),
             Target::Nano(options) => nano::write(grids, options, &mut bytes),
+            Target::Packed(_) => Ok(()),
         };
         // The inputs were sound, so nothing of the advice for damaged files applies.
         written.map_err(|error| Failure::file(path, format!("cannot write this: {error}")))?;
@@ -196,6 +280,16 @@ fn target(args: &Args, output: &Path) -> Result<Target, Failure> {
             Err(Failure::Usage(format!("{option} is for outputs with the extension {extension}")))
         })
     };
+    let absolute = |bound: Option<Bound>| match bound {
+        None => Ok(0.0),
+        Some(Bound::Absolute(error)) => Ok(error),
+        Some(Bound::OfPeak(_)) => {
+            Err(Failure::Usage("--encoding fpn takes an error in the grid's own numbers".into()))
+        }
+    };
+    if !matches!(extension.as_deref(), Some("nuage")) {
+        misplaced(&args.pack.given(), ".nuage")?;
+    }
     match extension.as_deref() {
         Some("vdb") => {
             misplaced(
@@ -229,18 +323,42 @@ fn target(args: &Args, output: &Path) -> Result<Target, Failure> {
                 NanoEncoding::Fp16 => nano::Encoding::Fp16,
                 NanoEncoding::Fp8 => nano::Encoding::Fp8,
                 NanoEncoding::Fp4 => nano::Encoding::Fp4,
-                NanoEncoding::Fpn => nano::Encoding::FpN { max_error: args.max_error.unwrap_or_default() },
+                NanoEncoding::Fpn => nano::Encoding::FpN { max_error: absolute(args.max_error)? },
             };
-            let codec = match args.codec.unwrap_or(NanoCodec::None) {
-                NanoCodec::None => nano::Codec::None,
-                NanoCodec::Zip => nano::Codec::Zip,
-                NanoCodec::Blosc => nano::Codec::Blosc,
+            let codec = match args.codec {
+                None => nano::Codec::None,
+                Some(CodecChoice::Nano(codec)) => codec,
+                Some(CodecChoice::Packed(_)) => {
+                    return Err(Failure::Usage("the codecs of .nvdb files are none, zip and blosc".into()));
+                }
             };
             Ok(Target::Nano(nano::WriteOptions { encoding, codec }))
         }
+        Some("nuage") => {
+            misplaced(
+                &[
+                    ("--compression", args.compression.is_some()),
+                    ("--no-active-mask", args.no_active_mask),
+                    ("--half", args.half),
+                    ("--full", args.full),
+                ],
+                ".vdb",
+            )?;
+            misplaced(&[("--encoding", args.encoding.is_some())], ".nvdb")?;
+            let codec = match args.codec {
+                None => None,
+                Some(CodecChoice::Packed(codec)) => Some(codec),
+                Some(CodecChoice::Nano(_)) => {
+                    return Err(Failure::Usage("none, zip and blosc are codecs of .nvdb files".into()));
+                }
+            };
+            Ok(Target::Packed(args.pack.options(args.max_error, codec)?))
+        }
         _ => {
             let output = output.display();
-            Err(Failure::Usage(format!("the output '{output}' must have the extension .vdb or .nvdb")))
+            Err(Failure::Usage(format!(
+                "the output '{output}' must have the extension .vdb, .nvdb or .nuage"
+            )))
         }
     }
 }

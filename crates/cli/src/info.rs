@@ -11,6 +11,7 @@ use nuage_vdb::{AnyFile, AnyTree, File, Histogram, Source, Statistics, nano};
 use serde_json::Value;
 
 use crate::error::{Failure, explain};
+use crate::frames;
 use crate::source::{DiskFile, Memory};
 use crate::{json, text};
 
@@ -115,6 +116,12 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
 
 /// Prints one file. Whether all its grids that should be readable are.
 fn show_file(path: &Path, args: &Args, after_another: bool, out: &mut impl Write) -> Result<bool, Failure> {
+    if let (false, Some((packed, None))) = (args.json, frames::packed(path)) {
+        if after_another {
+            writeln!(out)?;
+        }
+        show_packed(&packed, out)?;
+    }
     let opened = DiskFile::open(path);
     let disk = opened.or_else(|failure| failed(path, failure, args, out))?;
     let file = match disk.any(args.memory).or_else(|failure| failed(path, failure, args, out))? {
@@ -145,6 +152,45 @@ fn show_file(path: &Path, args: &Args, after_another: bool, out: &mut impl Write
         writeln!(out, "{}", json::file(path, disk.size(), &file, grids))?;
     }
     Ok(complete)
+}
+
+/// Prints what a packed file holds besides the grids of its frames.
+fn show_packed(path: &Path, out: &mut impl Write) -> Result<(), Failure> {
+    let disk = DiskFile::open_plain(path)?;
+    let asset = frames::open(path)?;
+    let contents = asset.contents();
+    let [first, last] =
+        [0, contents.frames.len().saturating_sub(1)].map(|frame| frames::number(&asset, frame));
+    let rate =
+        contents.frame_rate.map_or(String::new(), |rate| format!(", {} per second", text::number(rate)));
+    let memory = asset.memory_bytes();
+    writeln!(
+        out,
+        "{}: packed, {} bytes",
+        text::one_line(&path.display().to_string()),
+        text::thousands(disk.size())
+    )?;
+    writeln!(out, "  frames      {} ({first} to {last}{rate})", contents.frames.len())?;
+    writeln!(
+        out,
+        "  in memory   tree {}, bricks {}, shapes {} bytes",
+        text::thousands(memory.trees as u64),
+        text::thousands(memory.bricks as u64),
+        text::thousands(memory.shapes as u64)
+    )?;
+    for channel in &contents.channels {
+        let axis = channel.component.map_or("", |c| [".x", ".y", ".z"][usize::from(c.min(2))]);
+        writeln!(
+            out,
+            "  channel     {}{axis} ({:?}), peak {}, largest error {}",
+            text::one_line(&channel.name),
+            channel.role,
+            text::number(f64::from(channel.peak)),
+            text::number(f64::from(channel.quality.max_error))
+        )?;
+    }
+    writeln!(out, "  the first frame; {}#N is frame N:", text::one_line(&path.display().to_string()))?;
+    Ok(())
 }
 
 /// Prints a NanoVDB file. Whether all its grids that should be readable are.

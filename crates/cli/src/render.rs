@@ -14,6 +14,7 @@ use nuage_render::output::png::encode_png;
 use nuage_volume::channel::IndexBox;
 
 use crate::error::Failure;
+use crate::frames;
 use crate::look::Look;
 use crate::progress;
 use crate::shot::{self, Shot, Volume};
@@ -22,13 +23,14 @@ use crate::source::DiskFile;
 /// Volumes of a sequence that are looked at to settle automatic scales.
 const FITTED_FRAMES: usize = 5;
 
-/// Render a .vdb file or a sequence of them to pictures.
+/// Render a .vdb file, a sequence of them or a packed file to pictures.
 ///
-/// A sequence is written smoke.####.vdb, smoke.%04d.vdb, as a glob in quotes, or as a folder. It has one camera,
+/// A sequence is written smoke.####.vdb, smoke.%04d.vdb, as a glob in quotes, or as a folder; of a .nuage file all
+/// frames are rendered, or one: smoke.nuage#12. It has one camera,
 /// fitted to the union of its frames' boxes, and one density scale.
 #[derive(clap::Args)]
 pub(crate) struct Args {
-    /// The file or sequence: smoke.vdb, smoke.####.vdb, smoke.%04d.vdb, 'smoke.*.vdb' or a folder
+    /// The file or sequence: smoke.vdb, smoke.nuage, smoke.####.vdb, smoke.%04d.vdb, 'smoke.*.vdb' or a folder
     input: String,
 
     /// Where to write: .png (sRGB, 8 bit) or .exr (linear); for a sequence with ####, %04d or $F4
@@ -79,12 +81,18 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(usize::from(threads)).build_global();
         pool.map_err(|e| Failure::Usage(format!("cannot start {threads} threads: {e}")))?;
     }
-    let sequence = find_frames(&args.input, args.frames.as_ref()).map_err(|e| plain(&args.input, e))?;
-    if !sequence.missing.is_empty() {
-        let missing: Vec<String> = sequence.missing.iter().map(i64::to_string).collect();
-        warn(&args.input, &format!("frames not there: {}", missing.join(", ")));
-    }
-    let frames = &sequence.frames;
+    let frames = &match frames::packed(Path::new(&args.input)) {
+        Some(_) => frames::find(Path::new(&args.input), args.frames.as_ref())?,
+        None => {
+            let sequence =
+                find_frames(&args.input, args.frames.as_ref()).map_err(|e| plain(&args.input, e))?;
+            if !sequence.missing.is_empty() {
+                let missing: Vec<String> = sequence.missing.iter().map(i64::to_string).collect();
+                warn(&args.input, &format!("frames not there: {}", missing.join(", ")));
+            }
+            sequence.frames
+        }
+    };
     let mut jobs = Vec::new();
     for frame in frames {
         let output =

@@ -9,8 +9,10 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use nuage_vdb::{AnyFile, Limits, Source};
+use nuage_volume::format::ReadAt;
 
 use crate::error::Failure;
+use crate::frames;
 
 /// How much memory a file may ask for: shared by the subcommands that look into files.
 #[derive(Debug, Clone, Copy, clap::Args)]
@@ -29,19 +31,36 @@ fn limits(text: &str) -> Result<Limits, String> {
     }
 }
 
-/// An open file on disk.
+/// An open file on disk, or a frame of a packed one.
 pub(crate) struct DiskFile {
     path: PathBuf,
     file: fs::File,
     size_bytes: u64,
+    /// The frame as a .vdb file, which is then what is read.
+    frame: Option<Vec<u8>>,
 }
 
 impl DiskFile {
-    /// Opens a file.
+    /// Opens a file. A packed one is read as a .vdb file of the frame that the path names, or of its first.
     ///
     /// # Errors
     /// If there is no such file, it may not be read, or it is a folder or a pipe.
     pub(crate) fn open(path: &Path) -> Result<Self, Failure> {
+        match frames::packed(path) {
+            Some((file, number)) => {
+                let mut disk = Self::open_plain(&file)?;
+                disk.frame = Some(frames::as_vdb(&file, number)?);
+                Ok(disk)
+            }
+            None => Self::open_plain(path),
+        }
+    }
+
+    /// Opens a file as it is.
+    ///
+    /// # Errors
+    /// As [`DiskFile::open`].
+    pub(crate) fn open_plain(path: &Path) -> Result<Self, Failure> {
         let cannot_open = |error| Failure::file(path, format!("cannot open the file: {error}"));
         // Asked before opening: opening a named pipe would wait for its writer.
         let kind = fs::metadata(path).map_err(cannot_open)?;
@@ -53,7 +72,7 @@ impl DiskFile {
         }
         let file = fs::File::open(path).map_err(cannot_open)?;
         let size_bytes = file.metadata().map_err(cannot_open)?.len();
-        Ok(DiskFile { path: path.to_owned(), file, size_bytes })
+        Ok(DiskFile { path: path.to_owned(), file, size_bytes, frame: None })
     }
 
     /// Reads the header of the file as a VDB file.
@@ -84,6 +103,19 @@ impl DiskFile {
 }
 
 impl Source for DiskFile {
+    fn size_bytes(&self) -> io::Result<u64> {
+        Ok(self.frame.as_ref().map_or(self.size_bytes, |frame| frame.len() as u64))
+    }
+
+    fn range(&self, offset: u64, len: usize) -> io::Result<Cow<'_, [u8]>> {
+        match &self.frame {
+            Some(frame) => Source::range(frame, offset, len),
+            None => ReadAt::range(self, offset, len),
+        }
+    }
+}
+
+impl ReadAt for DiskFile {
     fn size_bytes(&self) -> io::Result<u64> {
         Ok(self.size_bytes)
     }
@@ -129,13 +161,13 @@ mod tests {
         let bytes: Vec<u8> = (0..=255).collect();
         file.write_all(&bytes).unwrap();
         let disk = DiskFile::open(file.path()).unwrap();
-        assert_eq!(disk.size_bytes().unwrap(), 256);
+        assert_eq!(Source::size_bytes(&disk).unwrap(), 256);
         for (offset, len) in [(0, 256), (17, 100), (255, 1), (256, 0)] {
-            assert_eq!(*disk.range(offset as u64, len).unwrap(), bytes[offset..offset + len]);
+            assert_eq!(*Source::range(&disk, offset as u64, len).unwrap(), bytes[offset..offset + len]);
         }
         // The file is shorter than it was said to be, as when it is cut off while being read.
         file.as_file().set_len(100).unwrap();
-        assert_eq!(disk.range(50, 51).unwrap_err().kind(), io::ErrorKind::UnexpectedEof);
+        assert_eq!(Source::range(&disk, 50, 51).unwrap_err().kind(), io::ErrorKind::UnexpectedEof);
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! From sources to volumes: what an OpenVDB grid means as a medium, and how sequences lie on disk.
 //!
 //! [`import`] turns a decoded grid into a channel of the packed volume; [`select`] finds the grid that a user
-//! means; [`encode`] puts bricks into fewer bytes, [`cluster`] finds those that can share their values, and `pack`
+//! means; [`encode`] puts bricks into fewer bytes, [`cluster`] finds those that can share their values, and [`pack`]
 //! makes packed volumes of frames; with the feature `fs`, [`sequence`] turns `smoke.####.vdb` into frames and
 //! [`output`] writes files that appear whole or not at all.
 //!
@@ -15,6 +15,7 @@ pub mod encode;
 pub mod import;
 #[cfg(feature = "fs")]
 pub mod output;
+pub mod pack;
 pub mod select;
 #[cfg(feature = "fs")]
 pub mod sequence;

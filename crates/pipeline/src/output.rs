@@ -52,31 +52,47 @@ pub enum OutputError {
 /// # Errors
 /// [`OutputError`], with no partial file left behind.
 pub fn write_whole(path: &Path, bytes: &[u8], overwrite: bool) -> Result<(), OutputError> {
+    write_whole_with(path, overwrite, |file| {
+        file.write_all(bytes).map_err(|source| OutputError::Io { path: path.to_owned(), source })
+    })
+}
+
+/// The same with bytes that `write` puts into the file. If it fails, nothing appears.
+///
+/// # Errors
+/// That of `write`, or an [`OutputError`], with no partial file left behind.
+pub fn write_whole_with<T, E: From<OutputError>>(
+    path: &Path,
+    overwrite: bool,
+    write: impl FnOnce(&mut fs::File) -> Result<T, E>,
+) -> Result<T, E> {
     let error = |source| OutputError::Io { path: path.to_owned(), source };
     let exists = || OutputError::Exists { path: path.to_owned() };
     // Replacing a device such as /dev/null by a file would harm the whole system.
     if path.file_name().is_none() || fs::metadata(path).is_ok_and(|data| !data.is_file()) {
-        return Err(OutputError::NotAFile { path: path.to_owned() });
+        return Err(OutputError::NotAFile { path: path.to_owned() }.into());
     }
     let folder = match path.parent() {
         Some(folder) if !folder.as_os_str().is_empty() => folder,
         _ => Path::new("."),
     };
     if !folder.is_dir() {
-        return Err(OutputError::NoFolder { path: path.to_owned(), folder: folder.to_owned() });
+        return Err(OutputError::NoFolder { path: path.to_owned(), folder: folder.to_owned() }.into());
     }
     // Only saves the work: the rename below is what holds against a race.
     if !overwrite && path.symlink_metadata().is_ok() {
-        return Err(exists());
+        return Err(exists().into());
     }
     let mut file = temporary_in(folder).map_err(error)?;
-    file.write_all(bytes).map_err(error)?;
+    let written = write(file.as_file_mut())?;
     file.as_file().sync_all().map_err(error)?;
     let renamed = if overwrite { file.persist(path) } else { file.persist_noclobber(path) };
     match renamed {
-        Ok(_) => Ok(()),
-        Err(failed) if !overwrite && failed.error.kind() == io::ErrorKind::AlreadyExists => Err(exists()),
-        Err(failed) => Err(error(failed.error)),
+        Ok(_) => Ok(written),
+        Err(failed) if !overwrite && failed.error.kind() == io::ErrorKind::AlreadyExists => {
+            Err(exists().into())
+        }
+        Err(failed) => Err(error(failed.error).into()),
     }
 }
 

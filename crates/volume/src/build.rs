@@ -172,14 +172,23 @@ impl TreeBuilder {
     ///
     /// # Panics
     /// If `bricks` holds another number of bricks than were added.
-    pub fn finish(mut self, bricks: Bricks) -> Result<Tree, BuildError> {
+    pub fn finish(self, bricks: Bricks) -> Result<Tree, BuildError> {
         assert_eq!(bricks.len(), self.summaries.len(), "one array entry per brick added");
-        if bricks.len() >= INDEX_LIMIT {
+        Ok(Tree { bricks, ..self.topology()? })
+    }
+
+    /// The tree without the values of its bricks, for who keeps them elsewhere.
+    ///
+    /// # Errors
+    /// If there are more bricks or entries than indices.
+    pub fn topology(mut self) -> Result<Tree, BuildError> {
+        if self.summaries.len() >= INDEX_LIMIT {
             return Err(BuildError::Limit { what: "bricks", limit: INDEX_LIMIT as u64 });
         }
         for (brick, log2_bricks, axes) in self.regions_before_others() {
             self.add_zero_region(brick, log2_bricks, axes);
         }
+        let bricks = Bricks::F32(Vec::new());
         let mut tree = Tree { root: Vec::new(), node5: Nodes::default(), node4: Nodes::default(), bricks };
         for (cell, slot) in &self.root {
             let cell = IVec3::from_array(*cell);

@@ -7,7 +7,7 @@
 
 use nuage_volume::codec::Codec;
 
-use super::quantize::{CODECS, Error};
+use super::quantize::Error;
 
 /// What a channel's bricks have to keep to.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -18,27 +18,21 @@ pub struct Target {
     pub squared_error: Option<f64>,
     /// The most words that all bricks may take. As long as they do, more are spent to reduce the error.
     pub words: Option<u64>,
-    /// Use this codec for all bricks that it can hold.
-    pub only: Option<Codec>,
 }
 
 /// How λ is stepped: as powers of two of this many parts.
-const STEPS_PER_OCTAVE: i32 = 2;
+const STEPS_PER_OCTAVE: i32 = 8;
 /// Beyond 2^±this, λ makes no difference.
 const LAST_OCTAVE: i32 = 120;
 
-/// The codec of each brick, as indices into [`CODECS`], from the errors that [`super::quantize::measure`] gives.
-pub fn choose(bricks: &[[Option<Error>; CODECS.len()]], target: &Target) -> Vec<usize> {
-    if let Some(only) = target.only {
-        let exact = CODECS.len() - 1;
-        let codec = CODECS.iter().position(|codec| *codec == only).unwrap_or(exact);
-        return bricks.iter().map(|errors| if errors[codec].is_some() { codec } else { exact }).collect();
-    }
-    let pick = |errors: &[Option<Error>; CODECS.len()], lambda: f64| {
-        let mut best = (CODECS.len() - 1, f64::INFINITY);
+/// The codec of each brick, as indices into `codecs`, from the errors that [`super::quantize::measure`] gives. The last
+/// codec is that of bricks which none of the others can hold.
+pub fn choose(codecs: &[Codec], bricks: &[Vec<Option<Error>>], target: &Target) -> Vec<usize> {
+    let pick = |errors: &[Option<Error>], lambda: f64| {
+        let mut best = (codecs.len() - 1, f64::INFINITY);
         for (i, error) in errors.iter().enumerate() {
             let Some(error) = error else { continue };
-            let cost = CODECS[i].word_count() as f64 + lambda * error.squared;
+            let cost = codecs[i].word_count() as f64 + lambda * f64::from(error.squared);
             if cost < best.1 && target.max_error.is_none_or(|bound| error.max <= bound) {
                 best = (i, cost);
             }
@@ -49,7 +43,8 @@ pub fn choose(bricks: &[[Option<Error>; CODECS.len()]], target: &Target) -> Vec<
     let totals = |step: i32| {
         bricks.iter().fold((0.0, 0), |(squared, words), errors| {
             let i = pick(errors, lambda(step));
-            (squared + errors[i].map_or(0.0, |error| error.squared), words + CODECS[i].word_count() as u64)
+            let error = errors[i].map_or(0.0, |error| f64::from(error.squared));
+            (squared + error, words + codecs[i].word_count() as u64)
         })
     };
     let last = LAST_OCTAVE * STEPS_PER_OCTAVE;
@@ -77,10 +72,10 @@ fn first(mut low: i32, mut high: i32, holds: impl Fn(i32) -> bool) -> i32 {
 
 #[cfg(test)]
 mod tests {
-    use super::super::quantize::{ChannelScale, measure};
+    use super::super::quantize::{CODECS, ChannelScale, measure};
     use super::*;
 
-    fn bricks() -> Vec<[Option<Error>; CODECS.len()]> {
+    fn bricks() -> Vec<Vec<Option<Error>>> {
         let scale = ChannelScale {
             unit: 1.0,
             floor: 0.0,
@@ -91,20 +86,20 @@ mod tests {
         let wave =
             |i: usize, brick: usize| ((i * i * (brick + 3)) as f32 * 0.001).sin() * 0.4 / (1 + brick) as f32;
         let brick = |brick: usize| std::array::from_fn(|i| 0.5 + wave(i, brick));
-        (0..40).map(|i| measure(&brick(i), &scale)).collect()
+        (0..40).map(|i| measure(&brick(i), &CODECS, &scale)).collect()
     }
 
-    fn totals(bricks: &[[Option<Error>; CODECS.len()]], chosen: &[usize]) -> (f64, f32, u64) {
+    fn totals(bricks: &[Vec<Option<Error>>], chosen: &[usize]) -> (f64, f32, u64) {
         chosen.iter().zip(bricks).fold((0.0, 0.0, 0), |(squared, max, words), (i, errors)| {
             let error = errors[*i].unwrap();
-            (squared + error.squared, error.max.max(max), words + CODECS[*i].word_count() as u64)
+            (squared + f64::from(error.squared), error.max.max(max), words + CODECS[*i].word_count() as u64)
         })
     }
 
     #[test]
     fn targets_are_met_and_cost_what_they_must() {
         let bricks = bricks();
-        let of = |target: Target| totals(&bricks, &choose(&bricks, &target));
+        let of = |target: Target| totals(&bricks, &choose(&CODECS, &bricks, &target));
         let bounded = |bound: f32| of(Target { max_error: Some(bound), ..Target::default() });
         let (mut last_words, mut cheapest) = (u64::MAX, 0);
         for bound in [1e-7, 1e-4, 1e-3, 1e-2, 1e-1, 1.0] {
@@ -128,13 +123,5 @@ mod tests {
         let both = Target { words: Some(100_000), squared_error: Some(0.1), ..Target::default() };
         let one = Target { squared_error: Some(0.1), ..Target::default() };
         assert_eq!(of(both), of(one), "no more words than the error asks for");
-    }
-
-    #[test]
-    fn a_codec_can_be_forced() {
-        let bricks = bricks();
-        let codec = Codec::Uniform { bits: 4 };
-        let chosen = choose(&bricks, &Target { only: Some(codec), ..Target::default() });
-        assert!(chosen.iter().all(|i| CODECS[*i] == codec));
     }
 }

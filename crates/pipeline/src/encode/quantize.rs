@@ -10,6 +10,8 @@ use half::f16;
 use nuage_volume::codec::{BrickContext, Codec, Line, codes, interpolate_corners};
 use nuage_volume::space::BRICK_VOXELS;
 
+use super::block;
+
 /// The values of a brick.
 pub type Brick = [f32; BRICK_VOXELS];
 
@@ -32,12 +34,12 @@ pub struct ChannelScale {
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Error {
     /// The sum of squares over all voxels.
-    pub squared: f64,
+    pub squared: f32,
     /// The largest of a voxel.
     pub max: f32,
 }
 
-/// The codecs that are tried, the cheapest first.
+/// The codecs that are tried unless one is asked for, the cheapest first.
 pub const CODECS: [Codec; 19] = [
     Codec::Constant,
     Codec::Gradient { bits: 0 },
@@ -60,28 +62,39 @@ pub const CODECS: [Codec; 19] = [
     Codec::F32,
 ];
 
-/// The error of a brick in each of [`CODECS`], `None` where the codec cannot hold it: empty voxels would not stay
+/// The error of a brick in each of some codecs, `None` where the codec cannot hold it: empty voxels would not stay
 /// empty, or a sign would change. [`Codec::F32`] always can.
-pub fn measure(values: &Brick, scale: &ChannelScale) -> [Option<Error>; CODECS.len()] {
-    let gradient = Gradient::fit(values, scale);
+pub fn measure(values: &Brick, codecs: &[Codec], scale: &ChannelScale) -> Vec<Option<Error>> {
+    let is_gradient = |codec: &Codec| matches!(codec, Codec::Gradient { .. });
+    let gradient = codecs.iter().any(is_gradient).then(|| Gradient::fit(values, scale));
     let zero = [0.0; BRICK_VOXELS];
-    CODECS.map(|codec| match codec {
-        Codec::Constant => check(values, &[constant(values); BRICK_VOXELS], scale),
-        Codec::Uniform { bits } => {
+    let measure = |codec: &Codec| match (*codec, &gradient) {
+        (Codec::Constant, _) => check(values, &[constant(values); BRICK_VOXELS], scale),
+        (Codec::Uniform { bits }, _) => {
             let line = line_over(values, &zero, scale, bits);
             quantized_error(values, &zero, line, bits, scale)
         }
-        Codec::Gradient { bits: 0 } => check(values, &floored(gradient.predicted, scale.floor), scale),
-        Codec::Gradient { bits } => {
+        (Codec::Gradient { bits: 0 }, Some(gradient)) => {
+            check(values, &floored(gradient.predicted, scale.floor), scale)
+        }
+        (Codec::Gradient { bits }, Some(gradient)) => {
             let line = line_over(values, &gradient.predicted, scale, bits);
             quantized_error(values, &gradient.predicted, line, bits, scale)
         }
-        Codec::F16 => {
+        (Codec::F16, _) => {
             let rounded = values.map(|value| f16::from_f32(value / scale.unit).to_f32() * scale.unit);
             check(values, &rounded, scale)
         }
-        Codec::F32 | Codec::Shared => Some(Error::default()),
-    })
+        (Codec::Block { .. }, _) => {
+            let mut words = Vec::new();
+            write(values, *codec, scale, &mut words);
+            let mut decoded = [0.0; BRICK_VOXELS];
+            decode(*codec, &words, scale, &mut decoded).then(|| check(values, &decoded, scale)).flatten()
+        }
+        (Codec::F32, _) => Some(Error::default()),
+        (Codec::Gradient { .. } | Codec::Shared, _) => None,
+    };
+    codecs.iter().map(measure).collect()
 }
 
 /// The value that stands for a brick of [`Codec::Constant`]: halfway between its bounds.
@@ -94,7 +107,7 @@ pub fn constant(values: &Brick) -> f32 {
 /// Appends the words of a brick in a codec: those that [`measure`] measured.
 ///
 /// # Panics
-/// If the codec is not one of [`CODECS`].
+/// If the codec is [`Codec::Shared`], which takes more than the brick's own values.
 pub fn write(values: &Brick, codec: Codec, scale: &ChannelScale, words: &mut Vec<u32>) {
     match codec {
         Codec::Constant => {}
@@ -119,8 +132,40 @@ pub fn write(values: &Brick, codec: Codec, scale: &ChannelScale, words: &mut Vec
             let pairs = values.as_chunks::<2>().0;
             words.extend(pairs.iter().map(|[low, high]| half(*low) | half(*high) << 16));
         }
+        Codec::Block { .. } => write_block(values, codec, scale, words),
         Codec::F32 => words.extend(values.iter().map(|value| value.to_bits())),
         Codec::Shared => unreachable!("a shared brick needs a shape"),
+    }
+}
+
+/// How often a block is encoded anew with its range reaching further below the floor.
+const BLOCK_ROUNDS: usize = 5;
+
+/// Appends the words of a brick of texture blocks. These spread errors over the texels of a block, to empty ones too:
+/// the range reaches as far below the floor as is needed for what is wrong there to end at the floor.
+fn write_block(values: &Brick, codec: Codec, scale: &ChannelScale, words: &mut Vec<u32>) {
+    let Codec::Block { format, axis } = codec else { return };
+    let (min, max) = bounds(values.iter().copied());
+    let begin = words.len();
+    let mut below = 0.0;
+    for _ in 0..BLOCK_ROUNDS {
+        let line = StoredLine::covering((min - below).max(-scale.unit), max, 1, scale.unit);
+        let inverse = inverse(line.line);
+        let normalised = values.map(|value| (value - line.line.low) * inverse);
+        let bytes = block::encode_brick(format, axis, &normalised, block::Quality::Fast);
+        words.truncate(begin);
+        words.push(line.word);
+        words.extend(bytes.as_chunks::<4>().0.iter().map(|bytes| u32::from_le_bytes(*bytes)));
+        let mut decoded = [0.0; BRICK_VOXELS];
+        if min != scale.floor || !decode(codec, &words[begin..], scale, &mut decoded) {
+            return;
+        }
+        let empty = values.iter().zip(&decoded).filter(|(value, _)| **value == scale.floor);
+        let fog = empty.fold(0.0_f32, |fog, (_, decoded)| fog.max(decoded - scale.floor));
+        if fog <= scale.background_tolerance {
+            return;
+        }
+        below += 1.25 * fog;
     }
 }
 
@@ -245,9 +290,9 @@ fn check(values: &Brick, decoded: &Brick, scale: &ChannelScale) -> Option<Error>
     }
     let largest = |lanes: [f32; LANES]| lanes.iter().copied().fold(0.0, f32::max);
     let is_sound = largest(fog) <= scale.background_tolerance && !(scale.keeps_sign && flips > 0);
-    let squared: f64 = squared.iter().map(|lane| f64::from(*lane)).sum();
+    let squared: f32 = squared.iter().sum();
     // Squares of large values overflow: such a codec is of no use. False for NaN.
-    (is_sound && squared < f64::from(f32::MAX)).then(|| Error { squared, max: largest(max) })
+    (is_sound && squared < f32::MAX).then(|| Error { squared, max: largest(max) })
 }
 
 /// The corners of a brick and what they predict.
@@ -328,13 +373,14 @@ fn fit_corners(values: &Brick) -> [f32; 8] {
 
 /// Decodes words that [`write()`] wrote.
 pub fn decode(codec: Codec, words: &[u32], scale: &ChannelScale, out: &mut Brick) -> bool {
-    let context = BrickContext { words, unit: scale.unit, floor: scale.floor };
+    let context = BrickContext { words, shapes: &[], unit: scale.unit, floor: scale.floor };
     context.decode(codec, 0, out).is_ok()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use nuage_volume::codec::block::{BlockFormat, PackingAxis};
     use proptest::prelude::*;
 
     fn scale(background: f32) -> ChannelScale {
@@ -369,9 +415,12 @@ mod tests {
         ) {
             let values = brick(normal, offset, curve, noise, is_distance);
             let scale = scale(if is_distance { 1.0 } else { 0.0 });
-            let errors = measure(&values, &scale);
+            let blocks = [BlockFormat::Bc3, BlockFormat::Bc4, BlockFormat::Bc7];
+            let blocks = blocks.map(|format| Codec::Block { format, axis: PackingAxis::Y });
+            let codecs = [&CODECS[..], &blocks].concat();
+            let errors = measure(&values, &codecs, &scale);
             prop_assert!(errors[CODECS.len() - 1] == Some(Error::default()));
-            for (codec, error) in CODECS.into_iter().zip(errors) {
+            for (codec, error) in codecs.into_iter().zip(errors) {
                 let Some(error) = error else { continue };
                 let mut words = Vec::new();
                 write(&values, codec, &scale, &mut words);
@@ -383,7 +432,7 @@ mod tests {
                 let max = values.iter().zip(&decoded).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
                 let squared: f64 = values.iter().zip(&decoded).map(|(a, b)| f64::from(a - b).powi(2)).sum();
                 prop_assert_eq!(max, error.max, "{:?}", codec);
-                prop_assert!((squared - error.squared).abs() <= 1e-4 * squared + 1e-12);
+                prop_assert!((squared - f64::from(error.squared)).abs() <= 1e-4 * squared + 1e-12);
                 for (value, decoded) in values.iter().zip(&decoded) {
                     prop_assert!(*value != scale.background || (decoded - value).abs() <= 1e-3);
                     prop_assert!(!scale.keeps_sign || (*value < 0.0) == (*decoded < 0.0));
@@ -401,7 +450,7 @@ mod tests {
     #[test]
     fn a_linear_ramp_is_its_corners() {
         let values = brick([1.0, 0.5, 0.25], 1.0, 0.0, 0.0, false);
-        let errors = measure(&values, &scale(0.0));
+        let errors = measure(&values, &CODECS, &scale(0.0));
         assert!(errors[1].is_some_and(|error| error.max < 0.01), "{:?}", errors[1]);
         assert!(errors[2].is_some_and(|error| error.max > 0.2));
     }

@@ -12,11 +12,13 @@ pub mod block;
 pub mod bounds;
 pub mod codes;
 
+use block::{BlockFormat, PackingAxis};
+
 use crate::brick::f32_from_finite_f16;
 use crate::space::BRICK_VOXELS;
 
 /// How a brick is stored.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Codec {
     /// One value, which stands in the entry itself.
     Constant,
@@ -41,7 +43,18 @@ pub enum Codec {
     /// as they are); the shape's offset in the shape store; the tag of its codec. A shape is stored as a brick is, and
     /// is not shared itself.
     Shared,
+    /// Texture blocks as [`block`] lays them out, in words of four bytes, the first lowest: a word with the value of 0 and
+    /// what is added to it for 1, both half floats in units, then the blocks.
+    Block {
+        /// The kind of block.
+        format: BlockFormat,
+        /// The axis that runs through the channels, or the slices.
+        axis: PackingAxis,
+    },
 }
+
+const FORMATS: [BlockFormat; 3] = [BlockFormat::Bc4, BlockFormat::Bc3, BlockFormat::Bc7];
+const AXES: [PackingAxis; 3] = [PackingAxis::X, PackingAxis::Y, PackingAxis::Z];
 
 impl Codec {
     /// The codec's number in a file.
@@ -53,6 +66,19 @@ impl Codec {
             Codec::F32 => 10,
             Codec::Shared => 11,
             Codec::Gradient { bits } => 16 + bits,
+            Codec::Block { format, axis } => {
+                let axis = match axis {
+                    PackingAxis::X => 0,
+                    PackingAxis::Y => 1,
+                    PackingAxis::Z => 2,
+                };
+                let first = match format {
+                    BlockFormat::Bc4 => 32,
+                    BlockFormat::Bc3 => 36,
+                    BlockFormat::Bc7 => 40,
+                };
+                first + axis
+            }
         }
     }
 
@@ -65,6 +91,10 @@ impl Codec {
             10 => Some(Codec::F32),
             11 => Some(Codec::Shared),
             16..=24 => Some(Codec::Gradient { bits: tag - 16 }),
+            32..=43 => {
+                let (format, axis) = (usize::from(tag - 32) / 4, usize::from(tag) % 4);
+                Some(Codec::Block { format: FORMATS[format], axis: *AXES.get(axis)? })
+            }
             _ => None,
         }
     }
@@ -79,6 +109,7 @@ impl Codec {
             Codec::Gradient { bits: 0 } => 3,
             Codec::Gradient { bits } => 4 + codes::word_count(bits),
             Codec::Shared => 3,
+            Codec::Block { format, .. } => 1 + format.brick_bytes() / 4,
         }
     }
 }
@@ -219,6 +250,15 @@ impl BrickContext<'_> {
                     codes::unpack(bits, words, out, |predicted, code| predicted + line.at(code));
                 }
             }
+            (Codec::Block { format, axis }, [line, words @ ..]) => {
+                let line = Line::from_word(*line, self.unit)?;
+                let mut bytes = [0; 256];
+                for (bytes, word) in bytes.as_chunks_mut::<4>().0.iter_mut().zip(words) {
+                    *bytes = word.to_le_bytes();
+                }
+                block::decode_brick(format, axis, &bytes, out).ok_or(DecodeError::OutOfStore)?;
+                out.iter_mut().for_each(|value| *value = line.low + line.step * *value);
+            }
             (Codec::Shared, [line, shape, tag]) if may_share => {
                 let line = Line::from_word(*line, self.unit)?;
                 let codec = u8::try_from(*tag).ok().and_then(Codec::from_tag);
@@ -242,7 +282,7 @@ mod tests {
     #[test]
     fn tags_and_codecs_are_inverse() {
         let all: Vec<Codec> = (0..=255).filter_map(Codec::from_tag).collect();
-        assert_eq!(all.len(), 21);
+        assert_eq!(all.len(), 30);
         for (i, codec) in all.iter().enumerate() {
             assert_eq!(Codec::from_tag(codec.tag()), Some(*codec));
             assert!(!all[..i].contains(codec));

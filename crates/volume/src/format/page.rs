@@ -11,7 +11,7 @@ use crate::codec::{Codec, codes};
 use crate::space::BRICK_VOXELS;
 
 /// One more than the largest tag of a codec.
-const TAGS: usize = 25;
+const TAGS: usize = 43;
 
 /// How the values of all bricks of a codec are stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -49,7 +49,7 @@ const HEAD_STREAMS: usize = 4;
 fn head(codec: Codec) -> &'static [usize] {
     match codec {
         Codec::Constant | Codec::F16 | Codec::F32 => &[],
-        Codec::Uniform { .. } => &[LINES],
+        Codec::Uniform { .. } | Codec::Block { .. } => &[LINES],
         Codec::Gradient { bits: 0 } => &[LINES, CORNERS, CORNERS],
         Codec::Gradient { .. } => &[LINES, CORNERS, CORNERS, LINES],
         Codec::Shared => &[LINES, SHAPE_OFFSETS, SHAPE_TAGS],
@@ -61,6 +61,8 @@ fn head(codec: Codec) -> &'static [usize] {
 enum Values {
     None,
     Codes(u8),
+    /// So many words of texture blocks, which have no neighbours that predict them.
+    Blocks(usize),
     Halves,
     Floats,
 }
@@ -70,6 +72,7 @@ impl Values {
         match codec {
             Codec::Constant | Codec::Shared | Codec::Gradient { bits: 0 } => Values::None,
             Codec::Uniform { bits } | Codec::Gradient { bits } => Values::Codes(bits),
+            Codec::Block { .. } => Values::Blocks(codec.word_count() - 1),
             Codec::F16 => Values::Halves,
             Codec::F32 => Values::Floats,
         }
@@ -77,7 +80,7 @@ impl Values {
 
     fn plane_count(self) -> usize {
         match self {
-            Values::None | Values::Codes(_) => 1,
+            Values::None | Values::Codes(_) | Values::Blocks(_) => 1,
             Values::Halves => 2,
             Values::Floats => 4,
         }
@@ -90,6 +93,7 @@ impl Values {
                 (Values::None, _) => 0,
                 (Values::Codes(_), Mode::Predicted(_)) => BRICK_VOXELS,
                 (Values::Codes(bits), Mode::Words) => 4 * codes::word_count(bits),
+                (Values::Blocks(words), _) => 4 * words,
                 (Values::Halves, _) => 2 * BRICK_VOXELS,
                 (Values::Floats, _) => 4 * BRICK_VOXELS,
             }
@@ -119,7 +123,8 @@ pub(super) fn encode(codecs: &[Codec], words: &[u32]) -> Vec<u8> {
     for (tag, words) in values.iter().enumerate() {
         let Some(codec) = Codec::from_tag(tag as u8).filter(|_| !words.is_empty()) else { continue };
         let values = Values::of(codec);
-        let modes = Predictor::ALL.map(Mode::Predicted).into_iter().chain([Mode::Words]);
+        let predictors = if matches!(values, Values::Blocks(_)) { &[][..] } else { &Predictor::ALL };
+        let modes = predictors.iter().copied().map(Mode::Predicted).chain([Mode::Words]);
         let candidates = modes.map(|mode| (mode, encode_values(values, mode, words)));
         let best = candidates.min_by_key(|(_, bytes)| entropy_bits(bytes, values.plane_count()));
         if let Some((mode, bytes)) = best {
@@ -166,7 +171,9 @@ pub(super) fn decode(codecs: &[Codec], bytes: &[u8]) -> Option<Vec<u32>> {
 fn encode_values(values: Values, mode: Mode, words: &[u32]) -> Vec<u8> {
     match (values, mode) {
         (Values::None, _) => Vec::new(),
-        (Values::Codes(_), Mode::Words) => words.iter().flat_map(|word| word.to_le_bytes()).collect(),
+        (Values::Codes(_), Mode::Words) | (Values::Blocks(_), _) => {
+            words.iter().flat_map(|word| word.to_le_bytes()).collect()
+        }
         (Values::Codes(bits), Mode::Predicted(predictor)) => {
             let mut bytes = Vec::with_capacity(words.len() / usize::from(bits) * 32);
             for brick in words.chunks(codes::word_count(bits)) {
@@ -204,7 +211,7 @@ fn predicted<T: Number>(floats: &[T], mode: Mode, ordered: impl Fn(T) -> T) -> V
 /// The values of all bricks of a codec, one brick after the other.
 enum Stream<'a> {
     None,
-    Packed { bits: u8, bytes: &'a [u8] },
+    Packed { brick_bytes: usize, bytes: &'a [u8] },
     Codes { bits: u8, predictor: Predictor, bytes: &'a [u8] },
     Halves { mode: Mode, planes: Planes<'a, 2> },
     Floats { mode: Mode, planes: Planes<'a, 4> },
@@ -214,7 +221,10 @@ impl<'a> Stream<'a> {
     fn new(values: Values, mode: Mode, bytes: &'a [u8]) -> Stream<'a> {
         match (values, mode) {
             (Values::None, _) => Stream::None,
-            (Values::Codes(bits), Mode::Words) => Stream::Packed { bits, bytes },
+            (Values::Codes(bits), Mode::Words) => {
+                Stream::Packed { brick_bytes: 4 * codes::word_count(bits), bytes }
+            }
+            (Values::Blocks(words), _) => Stream::Packed { brick_bytes: 4 * words, bytes },
             (Values::Codes(bits), Mode::Predicted(predictor)) => Stream::Codes { bits, predictor, bytes },
             (Values::Halves, mode) => Stream::Halves { mode, planes: Planes::new(bytes) },
             (Values::Floats, mode) => Stream::Floats { mode, planes: Planes::new(bytes) },
@@ -225,8 +235,8 @@ impl<'a> Stream<'a> {
     fn next_brick(&mut self, words: &mut Vec<u32>) -> Option<()> {
         match self {
             Stream::None => {}
-            Stream::Packed { bits, bytes } => {
-                let brick = bytes.split_off(..4 * codes::word_count(*bits))?;
+            Stream::Packed { brick_bytes, bytes } => {
+                let brick = bytes.split_off(..*brick_bytes)?;
                 words.extend(brick.as_chunks().0.iter().map(|word| u32::from_le_bytes(*word)));
             }
             Stream::Codes { bits, predictor, bytes } => {

@@ -1,0 +1,200 @@
+//! Putting encoded frames one after the other into a file.
+//!
+//! Equal bricks stand in the file once, whatever frame and channel they come from, and so do equal nodes and masks. Only
+//! a digest of each brick is kept; the words go to the writer at once.
+
+use std::collections::HashMap;
+use std::io::{Seek, Write};
+
+use glam::IVec3;
+use nuage_volume::brick::BrickSummary;
+use nuage_volume::build::{BuildError, TreeBuilder};
+use nuage_volume::codec::{BrickContext, Codec};
+use nuage_volume::format::{ChannelInfo, Contents, FormatError, Frame, FrameGrid, Quality, Summary, Writer};
+use nuage_volume::packed::TreeRef;
+use nuage_volume::packed::build::{EntryScale, Packer, TooLarge};
+use nuage_volume::space::BRICK_VOXELS;
+
+use super::frame::{Bound, EncodedFrame, EncodedLevel, Options, map};
+use super::plan::Plan;
+use crate::encode::quantize::ChannelScale;
+
+/// Why a file cannot be put together.
+#[derive(Debug, thiserror::Error)]
+pub enum AssembleError {
+    /// It cannot be written.
+    #[error(transparent)]
+    Write(#[from] FormatError),
+    /// A tree is too large, or its regions overlap.
+    #[error(transparent)]
+    Build(#[from] BuildError),
+    /// All trees together are too large.
+    #[error(transparent)]
+    TooLarge(#[from] TooLarge),
+}
+
+/// What went into a file.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Report {
+    /// What is in the file.
+    pub contents: Contents,
+    /// The bytes of its parts on disk.
+    pub summary: Summary,
+    /// The bytes of the trees in memory.
+    pub tree_bytes: u64,
+    /// The bytes of all bricks in memory.
+    pub brick_bytes: u64,
+    /// The entries of all nodes.
+    pub entries: u64,
+    /// The bricks of the finest levels, each as often as it is used.
+    pub bricks_used: u64,
+    /// The bricks that are stored, of all levels.
+    pub bricks_stored: u64,
+}
+
+/// Writes frames to a file.
+pub struct Assembler<'c, W: Write + Seek> {
+    writer: Writer<'c, W>,
+    packer: Packer,
+    contents: Contents,
+    /// Where each brick stands, by a digest of its codec and words.
+    bricks: HashMap<u128, u32>,
+    stored_words: u64,
+    bricks_used: u64,
+}
+
+impl<'c, W: Write + Seek> Assembler<'c, W> {
+    /// Begins a file. `compress` makes a zstd frame of some bytes.
+    ///
+    /// # Errors
+    /// If nothing can be written.
+    pub fn new(
+        out: W,
+        compress: &'c dyn Fn(&[u8]) -> Vec<u8>,
+        plan: &Plan,
+        options: &Options,
+        frame_rate: Option<f64>,
+    ) -> Result<Self, AssembleError> {
+        let channel = |planned: &super::plan::ChannelPlan| {
+            let (scale, peak) = (planned.scale(0.0), planned.peak());
+            ChannelInfo {
+                name: planned.key.grid.clone(),
+                component: planned.key.component,
+                role: planned.role,
+                physical_unit: String::new(),
+                unit: scale.unit,
+                floor: scale.floor,
+                peak,
+                quality: Quality::default(),
+                asked_max_error: options.max_error.map(|bound| match bound {
+                    Bound::Absolute(error) => error,
+                    Bound::OfPeak(part) => part * peak,
+                }),
+                asked_psnr: options.psnr,
+            }
+        };
+        let channels = plan.channels.iter().map(channel).collect();
+        Ok(Assembler {
+            writer: Writer::new(out, compress)?,
+            packer: Packer::default(),
+            contents: Contents { frame_rate, channels, frames: Vec::new() },
+            bricks: HashMap::new(),
+            stored_words: 0,
+            bricks_used: 0,
+        })
+    }
+
+    /// Adds a frame behind those that are there.
+    ///
+    /// # Errors
+    /// If it cannot be written or the file becomes too large.
+    pub fn add(
+        &mut self,
+        frame: &EncodedFrame,
+        number: Option<i64>,
+        name: &str,
+    ) -> Result<(), AssembleError> {
+        let mut grids = Vec::with_capacity(frame.grids.len());
+        for grid in &frame.grids {
+            let levels = grid.levels.iter().map(|level| self.add_level(level, &grid.scale));
+            let levels = levels.collect::<Result<_, _>>()?;
+            self.bricks_used += grid.levels.first().map_or(0, |level| level.bricks.len()) as u64;
+            let quality = &mut self.contents.channels[grid.channel].quality;
+            quality.max_error = quality.max_error.max(grid.quality.max_error);
+            quality.squared_error += grid.quality.squared_error;
+            quality.voxels += grid.quality.voxels;
+            grids.push(FrameGrid {
+                channel: grid.channel as u32,
+                levels,
+                index_offset: grid.index_offset,
+                active_box: grid.active_box,
+                world_from_index: grid.world_from_index,
+                source_header: grid.source_header.clone(),
+            });
+        }
+        self.contents.frames.push(Frame { number, name: name.to_owned(), grids });
+        Ok(())
+    }
+
+    fn add_level(&mut self, level: &EncodedLevel, scale: &ChannelScale) -> Result<TreeRef, AssembleError> {
+        let background = scale.background;
+        let begins = [0].into_iter().chain(level.bricks.iter().map(|(_, _, end)| *end));
+        let bricks: Vec<(IVec3, Codec, &[u32])> = (level.bricks.iter().zip(begins))
+            .map(|((place, codec, end), begin)| (*place, *codec, &level.words[begin..*end]))
+            .collect();
+        // Trees know of no background but zero: they are built of what values differ from it.
+        let summaries = map(&bricks, |(_, codec, words)| {
+            let mut values = [background; BRICK_VOXELS];
+            let context = BrickContext { words, shapes: &[], unit: scale.unit, floor: scale.floor };
+            let decoded = context.decode(*codec, 0, &mut values);
+            debug_assert!(decoded.is_ok(), "what was encoded decodes");
+            values.iter_mut().for_each(|value| *value -= background);
+            BrickSummary::of(&values)
+        });
+        let mut builder = TreeBuilder::new();
+        let mut places = Vec::with_capacity(bricks.len());
+        for ((place, codec, words), summary) in bricks.iter().zip(summaries) {
+            builder.brick(*place, summary)?;
+            let mut digest = xxhash_rust::xxh3::Xxh3::new();
+            digest.update(&[codec.tag()]);
+            digest.update(bytemuck::cast_slice(words));
+            let offset = match self.bricks.get(&digest.digest128()) {
+                Some(offset) => *offset,
+                None => {
+                    let offset = self.writer.brick(*codec, words)?;
+                    self.bricks.insert(digest.digest128(), offset);
+                    self.stored_words += words.len() as u64;
+                    offset
+                }
+            };
+            places.push((*codec, offset));
+        }
+        let mut exact = HashMap::new();
+        for (place, size, value) in &level.tiles {
+            builder.tile(*place, *size, value - background)?;
+            exact.insert((value - background).to_bits(), *value);
+        }
+        let tree = builder.topology()?;
+        let constant = |value: f32| exact.get(&value.to_bits()).copied().unwrap_or(value + background);
+        let scale = EntryScale { unit: scale.unit, background };
+        Ok(self.packer.add(&tree, &places, scale, constant)?)
+    }
+
+    /// Ends the file.
+    ///
+    /// # Errors
+    /// If the rest cannot be written.
+    pub fn finish(self) -> Result<Report, AssembleError> {
+        let trees = self.packer.finish();
+        let summary = self.writer.finish(&self.contents, &trees)?;
+        Ok(Report {
+            summary,
+            tree_bytes: trees.size_bytes() as u64,
+            brick_bytes: 4 * self.stored_words,
+            entries: trees.entries.len() as u64,
+            bricks_used: self.bricks_used,
+            bricks_stored: self.bricks.len() as u64,
+            contents: self.contents,
+        })
+    }
+}
