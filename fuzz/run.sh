@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# Fuzzes the readers and writers of nuage-vdb: ten million runs or twenty minutes per target, whichever comes first.
+# Fuzzes the readers and writers of nuage-vdb, and the reader of packed files: ten million runs or twenty minutes per target, whichever comes first.
 #
-#   fuzz/run.sh [TARGET ...]        targets: read read_box round_trip metadata nanovdb
+#   fuzz/run.sh [TARGET ...]        targets: read read_box round_trip metadata nanovdb nuage
 #
 # RUNS (10000000) and SECS (1200) change the bounds, CARGO_FUZZ names another cargo-fuzz. Needs a C++ compiler. A crash
 # ends the run and leaves its input in fuzz/artifacts/TARGET.
@@ -11,7 +11,7 @@ cd "$(dirname "${BASH_SOURCE[0]}")"
 runs=${RUNS:-10000000}
 secs=${SECS:-1200}
 targets=("$@")
-if ((${#targets[@]} == 0)); then targets=(read read_box round_trip metadata nanovdb); fi
+if ((${#targets[@]} == 0)); then targets=(read read_box round_trip metadata nanovdb nuage); fi
 
 fuzz=${CARGO_FUZZ:-cargo-fuzz}
 if ! command -v "$fuzz" >/dev/null; then

@@ -30,6 +30,9 @@ fn main() -> std::io::Result<()> {
             std::fs::write(folder.join(name), bytes)?;
         }
     }
+    let packed = Path::new(&folder).join("nuage");
+    std::fs::create_dir_all(&packed)?;
+    std::fs::write(packed.join("all_codecs"), nuage_fuzz::packed_file())?;
     let nano = Path::new(&folder).join("nanovdb");
     std::fs::create_dir_all(&nano)?;
     for (name, bytes) in seeds.iter().filter(|(_, bytes)| bytes.len() <= MAX_SEED_BYTES) {

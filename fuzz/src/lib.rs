@@ -43,3 +43,27 @@ pub fn as_nanovdb(bytes: &[u8]) -> Vec<Vec<u8>> {
     };
     forms.iter().filter_map(write).collect()
 }
+
+/// A packed file with a brick of every codec, stored without compression, so that mutations reach what is inside.
+pub fn packed_file() -> Vec<u8> {
+    use nuage_volume::codec::Codec;
+    use nuage_volume::format::{Contents, Writer};
+    use nuage_volume::packed::Trees;
+
+    let mut out = std::io::Cursor::new(Vec::new());
+    let stored = |bytes: &[u8]| vec![0; bytes.len() + 1];
+    let write = |out| {
+        let mut writer = Writer::new(out, &stored)?;
+        let shape = writer.shape(Codec::Gradient { bits: 0 }, &[0x3c00, 1, 2])?;
+        for codec in (1..=24).filter_map(Codec::from_tag) {
+            let mut words = vec![0x1234_5678 & 0xb3ff_b3ff; codec.word_count()];
+            if codec == Codec::Shared {
+                words[1..].copy_from_slice(&[shape, 16]);
+            }
+            writer.brick(codec, &words)?;
+        }
+        writer.finish(&Contents::default(), &Trees::default())
+    };
+    write(&mut out).expect("a file in memory");
+    out.into_inner()
+}

@@ -19,7 +19,7 @@ pub mod write;
 
 pub use contents::{ChannelInfo, Contents, Frame, FrameGrid, Quality, Role};
 pub use error::{FormatError, Limits};
-pub use layout::Kind;
+pub use layout::{Kind, reseal};
 pub use read::{Asset, MemoryBytes};
 pub use source::ReadAt;
 pub use write::{Summary, Writer, write};

@@ -123,9 +123,12 @@ pub(super) fn encode(codecs: &[Codec], words: &[u32]) -> Vec<u8> {
     for (tag, words) in values.iter().enumerate() {
         let Some(codec) = Codec::from_tag(tag as u8).filter(|_| !words.is_empty()) else { continue };
         let values = Values::of(codec);
-        let predictors = if matches!(values, Values::Blocks(_)) { &[][..] } else { &Predictor::ALL };
-        let modes = predictors.iter().copied().map(Mode::Predicted).chain([Mode::Words]);
-        let candidates = modes.map(|mode| (mode, encode_values(values, mode, words)));
+        // Measured on clouds: a byte for a code of one or two bits never pays, however well it is predicted.
+        let modes = match values {
+            Values::Codes(..=2) | Values::Blocks(_) => vec![Mode::Words],
+            _ => Predictor::ALL.map(Mode::Predicted).to_vec(),
+        };
+        let candidates = modes.into_iter().map(|mode| (mode, encode_values(values, mode, words)));
         let best = candidates.min_by_key(|(_, bytes)| entropy_bits(bytes, values.plane_count()));
         if let Some((mode, bytes)) = best {
             out[tag] = mode.number();

@@ -10,20 +10,16 @@ use crate::space::BRICK_VOXELS;
 pub(super) enum Predictor {
     /// Zero: residuals are the numbers.
     Zero,
-    /// The number before along z; at z = 0 the one before along y, at y = z = 0 the one before along x.
-    Previous,
     /// Differences along z, then along y, then along x: exact where the numbers are a sum of functions of two axes.
     Lorenzo,
-    /// Half the sum of the numbers before along y and z, rounded down; at the faces as [`Predictor::Previous`], and at
-    /// y = 0 the number before along z.
+    /// Half the sum of the number before along x and the mean of those before along y and z, all halves rounded down;
+    /// without the former at x = 0. At y = 0 the number before along z, at z = 0 that along y, at both that along x. For
+    /// numbers of few bits, which are mostly noise.
     Average,
-    /// As [`Predictor::Average`], but of the average and the number before along x where all three are there.
-    Average3,
 }
 
 impl Predictor {
-    pub(super) const ALL: [Predictor; 5] =
-        [Predictor::Zero, Predictor::Previous, Predictor::Lorenzo, Predictor::Average, Predictor::Average3];
+    pub(super) const ALL: [Predictor; 3] = [Predictor::Zero, Predictor::Lorenzo, Predictor::Average];
 }
 
 /// Unsigned integers that wrap.
@@ -64,40 +60,37 @@ number!(u8);
 number!(u16);
 number!(u32);
 
-/// The prediction of a number from those before it: those of its row, of the row before it, if there is one, and of the
-/// row of the plane before.
+/// The average that predicts a number from those before it along x, y and z.
 #[inline(always)]
-fn predicted<T: Number>(
-    predictor: Predictor,
-    numbers: &[T; BRICK_VOXELS],
-    x: usize,
-    y: usize,
-    z: usize,
-) -> T {
+fn average<T: Number>(numbers: &[T; BRICK_VOXELS], x: usize, y: usize, z: usize) -> T {
     let at = x << 6 | y << 3 | z;
     let before = |step: usize| numbers[at.wrapping_sub(step) % BRICK_VOXELS];
-    match (predictor, x, y, z) {
-        (_, 0, 0, 0) | (Predictor::Zero | Predictor::Lorenzo, ..) => T::default(),
-        (_, _, 0, 0) => before(64),
-        (_, _, _, 0) => before(8),
-        (Predictor::Previous, ..) | (_, _, 0, _) => before(1),
-        (Predictor::Average3, 1.., ..) => before(1).mean(before(8)).mean(before(64)),
-        _ => before(1).mean(before(8)),
+    match (x, y, z) {
+        (0, 0, 0) => T::default(),
+        (_, 0, 0) => before(64),
+        (_, _, 0) => before(8),
+        (_, 0, _) => before(1),
+        (0, ..) => before(1).mean(before(8)),
+        _ => before(1).mean(before(8)).mean(before(64)),
     }
 }
 
 /// Replaces numbers by their residuals.
 pub(super) fn residuals<T: Number>(predictor: Predictor, numbers: &mut [T; BRICK_VOXELS], mask: T) {
-    if predictor == Predictor::Lorenzo {
-        for step in [1, 8, 64] {
-            for at in (step..BRICK_VOXELS).rev().filter(|at| at / step % 8 != 0) {
-                numbers[at] = numbers[at].minus(numbers[at - step]);
+    match predictor {
+        Predictor::Zero => {}
+        Predictor::Lorenzo => {
+            for step in [1, 8, 64] {
+                for at in (step..BRICK_VOXELS).rev().filter(|at| at / step % 8 != 0) {
+                    numbers[at] = numbers[at].minus(numbers[at - step]);
+                }
             }
         }
-    } else {
-        let given = *numbers;
-        for (at, number) in numbers.iter_mut().enumerate() {
-            *number = number.minus(predicted(predictor, &given, at >> 6, at >> 3 & 7, at & 7));
+        Predictor::Average => {
+            let given = *numbers;
+            for (at, number) in numbers.iter_mut().enumerate() {
+                *number = number.minus(average(&given, at >> 6, at >> 3 & 7, at & 7));
+            }
         }
     }
     numbers.iter_mut().for_each(|number| *number = number.masked(mask));
@@ -107,9 +100,16 @@ pub(super) fn residuals<T: Number>(predictor: Predictor, numbers: &mut [T; BRICK
 pub(super) fn restore<T: Number>(predictor: Predictor, numbers: &mut [T; BRICK_VOXELS], mask: T) {
     match predictor {
         Predictor::Zero => {}
-        Predictor::Previous => restore_each(Predictor::Previous, numbers, mask),
-        Predictor::Average => restore_each(Predictor::Average, numbers, mask),
-        Predictor::Average3 => restore_each(Predictor::Average3, numbers, mask),
+        Predictor::Average => {
+            for x in 0..8 {
+                for y in 0..8 {
+                    for z in 0..8 {
+                        let at = x << 6 | y << 3 | z;
+                        numbers[at] = numbers[at].plus(average(numbers, x, y, z)).masked(mask);
+                    }
+                }
+            }
+        }
         Predictor::Lorenzo => {
             // Sums along x and y are sums of whole planes and rows.
             let (planes, _) = numbers.as_chunks_mut::<64>();
@@ -130,18 +130,6 @@ pub(super) fn restore<T: Number>(predictor: Predictor, numbers: &mut [T; BRICK_V
         }
     }
     numbers.iter_mut().for_each(|number| *number = number.masked(mask));
-}
-
-#[inline(always)]
-fn restore_each<T: Number>(predictor: Predictor, numbers: &mut [T; BRICK_VOXELS], mask: T) {
-    for x in 0..8 {
-        for y in 0..8 {
-            for z in 0..8 {
-                let at = x << 6 | y << 3 | z;
-                numbers[at] = numbers[at].plus(predicted(predictor, numbers, x, y, z)).masked(mask);
-            }
-        }
-    }
 }
 
 #[cfg(test)]
@@ -181,7 +169,7 @@ mod tests {
         };
         assert_eq!(left(Predictor::Lorenzo, ramp), 1 + 7 * 3);
         assert_eq!(left(Predictor::Lorenzo, product), 7 * 7 * 3);
-        for predictor in [Predictor::Previous, Predictor::Average, Predictor::Average3, Predictor::Lorenzo] {
+        for predictor in [Predictor::Average, Predictor::Lorenzo] {
             assert_eq!(left(predictor, constant), 1);
         }
     }

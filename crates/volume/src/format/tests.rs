@@ -9,7 +9,7 @@ use super::page::tests::words;
 use super::*;
 use crate::brick::{BrickSummary, Bricks};
 use crate::build::TreeBuilder;
-use crate::codec::Codec;
+use crate::codec::{Codec, DecodeError};
 use crate::packed::build::{EntryScale, Packer};
 use crate::packed::store::BrickStore;
 use crate::packed::{Content, TreeRef, Trees};
@@ -267,6 +267,32 @@ fn roles_of_later_versions_are_other() {
 
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(200))]
+
+    #[test]
+    fn damage_under_right_checksums_is_an_error_or_an_asset(
+        changes in proptest::collection::vec((0_u16..2, any::<u32>(), any::<u8>()), 1..6),
+    ) {
+        let (contents, trees, store) = parts(31);
+        let mut out = Cursor::new(Vec::new());
+        // Nothing is compressed, so that damage reaches what is inside.
+        write(&mut out, &contents, &trees, &store, &|bytes| vec![0; bytes.len() + 1]).unwrap();
+        let mut bytes = out.into_inner();
+        let pages_end = u64::from_le_bytes(bytes[bytes.len() - 10 * layout::ROW_BYTES + 8..][..8].try_into().unwrap());
+        for (after_pages, at, byte) in changes {
+            let from = pages_end as usize * usize::from(after_pages);
+            let at = from + at as usize % (bytes.len() - from);
+            bytes[at] = byte;
+        }
+        reseal(&mut bytes);
+        let Ok(asset) = Asset::open_with(bytes.clone(), Limits { max_memory_bytes: 64 << 20 }) else { return Ok(()) };
+        prop_assert!(check::check(asset.contents(), asset.trees(), asset.store()).is_ok());
+        let Some((_, _, store)) = read_all(bytes) else { return Ok(()) };
+        let mut values = [0.0; 512];
+        for (i, codec) in store.codecs().iter().enumerate() {
+            let decoded = store.decode(*codec, store.offset(i), 1.0, 0.0, &mut values);
+            prop_assert!(decoded != Err(DecodeError::NoShape) && decoded != Err(DecodeError::OutOfStore));
+        }
+    }
 
     #[test]
     fn any_bytes_in_chunks_are_an_error_or_an_asset(
