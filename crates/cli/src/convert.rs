@@ -81,7 +81,8 @@ pub(crate) struct Args {
     max_error: Option<Bound>,
 
     /// How .nvdb files are compressed: none, zip or blosc [default: none]; the codec of all bricks in .nuage files that
-    /// it can hold: u1 to u8 (uniform codes of so many bits), g0 to g8 (the same around a gradient), f16, f32, or the
+    /// it can hold: u1 to u8 (uniform codes of so many bits), s1 to s8 (the same by
+    /// octants), g0 to g8 (the same around a gradient), f16, f32, or the
     /// texture blocks bc3, bc4 and bc7
     #[arg(long, value_name = "CODEC", value_parser = codec)]
     codec: Option<CodecChoice>,
@@ -133,9 +134,10 @@ fn codec(text: &str) -> Result<CodecChoice, String> {
         ("bc4", _) => packed(Codec::Block { format: BlockFormat::Bc4, axis: PackingAxis::Z }),
         ("bc7", _) => packed(Codec::Block { format: BlockFormat::Bc7, axis: PackingAxis::Z }),
         (text, Some(bits @ 1..=8)) if text.starts_with('u') => packed(Codec::Uniform { bits }),
+        (text, Some(bits @ 1..=8)) if text.starts_with('s') => packed(Codec::Split { bits }),
         (text, Some(bits @ 0..=8)) if text.starts_with('g') => packed(Codec::Gradient { bits }),
         _ => Err(
-            "there are none, zip, blosc for .nvdb and u1 to u8, g0 to g8, f16, f32, bc3, bc4, bc7 for .nuage"
+            "there are none, zip, blosc for .nvdb and u1 to u8, s1 to s8, g0 to g8, f16, f32, bc3, bc4, bc7 for .nuage"
                 .into(),
         ),
     }

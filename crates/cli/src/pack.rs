@@ -167,16 +167,16 @@ fn print(report: &Report, output: &Path, input_bytes: u64, seconds: f64) -> io::
         thousands(disk)
     )?;
     let memory = report.tree_bytes + report.brick_bytes;
-    let voxels = report.bricks_used * 512;
+    let voxels = report.source_bricks * 512;
     let per_voxel = |bytes: u64| rounded(bytes as f64 * 8.0 / voxels.max(1) as f64, 2);
     writeln!(
         out,
-        "  in memory {} bytes: tree {}, bricks {}; {} bits per voxel of {} bricks, of which {} are stored",
+        "  in memory {} bytes: tree {}, bricks {}; {} bits per voxel of {} bricks; {} are stored",
         thousands(memory),
         thousands(report.tree_bytes),
         thousands(report.brick_bytes),
         per_voxel(memory),
-        thousands(report.bricks_used),
+        thousands(report.source_bricks),
         thousands(report.bricks_stored),
     )?;
     writeln!(

@@ -7,7 +7,7 @@
 //! value lies below it is as good as exact. Such voxels take the next code below and get exactly the floor.
 
 use half::f16;
-use nuage_volume::codec::{BrickContext, Codec, Line, codes, interpolate_corners};
+use nuage_volume::codec::{BrickContext, Codec, Line, codes, interpolate_corners, octant_lines, octant_of};
 use nuage_volume::space::BRICK_VOXELS;
 
 use super::block;
@@ -40,19 +40,24 @@ pub struct Error {
 }
 
 /// The codecs that are tried unless one is asked for, the cheapest first.
-pub const CODECS: [Codec; 19] = [
+pub const CODECS: [Codec; 24] = [
     Codec::Constant,
     Codec::Gradient { bits: 0 },
     Codec::Uniform { bits: 1 },
     Codec::Gradient { bits: 1 },
+    Codec::Split { bits: 1 },
     Codec::Uniform { bits: 2 },
     Codec::Gradient { bits: 2 },
+    Codec::Split { bits: 2 },
     Codec::Uniform { bits: 3 },
     Codec::Gradient { bits: 3 },
+    Codec::Split { bits: 3 },
     Codec::Uniform { bits: 4 },
     Codec::Gradient { bits: 4 },
+    Codec::Split { bits: 4 },
     Codec::Uniform { bits: 5 },
     Codec::Gradient { bits: 5 },
+    Codec::Split { bits: 5 },
     Codec::Uniform { bits: 6 },
     Codec::Gradient { bits: 6 },
     Codec::Uniform { bits: 8 },
@@ -69,7 +74,7 @@ pub fn measure(values: &Brick, codecs: &[Codec], scale: &ChannelScale) -> Vec<Op
     let gradient = codecs.iter().any(is_gradient).then(|| Gradient::fit(values, scale));
     let zero = [0.0; BRICK_VOXELS];
     let measure = |codec: &Codec| match (*codec, &gradient) {
-        (Codec::Constant, _) => check(values, &[constant(values); BRICK_VOXELS], scale),
+        (Codec::Constant, _) => check(values, &[constant(values, scale); BRICK_VOXELS], scale),
         (Codec::Uniform { bits }, _) => {
             let line = line_over(values, &zero, scale, bits);
             quantized_error(values, &zero, line, bits, scale)
@@ -85,6 +90,17 @@ pub fn measure(values: &Brick, codecs: &[Codec], scale: &ChannelScale) -> Vec<Op
             let rounded = values.map(|value| f16::from_f32(value / scale.unit).to_f32() * scale.unit);
             check(values, &rounded, scale)
         }
+        (Codec::Split { bits }, _) => {
+            let split = Split::over(values, scale, bits);
+            let last_code = f32::from((1_u16 << bits) - 1);
+            let inverses = split.lines.map(inverse);
+            let decoded = std::array::from_fn(|i| {
+                let octant = octant_of(i);
+                let line = split.lines[octant];
+                line.low + line.step * code_of(values[i], 0.0, line, inverses[octant], last_code, scale.floor)
+            });
+            check(values, &floored(decoded, scale.floor), scale)
+        }
         (Codec::Block { .. }, _) => {
             let mut words = Vec::new();
             write(values, *codec, scale, &mut words);
@@ -97,8 +113,12 @@ pub fn measure(values: &Brick, codecs: &[Codec], scale: &ChannelScale) -> Vec<Op
     codecs.iter().map(measure).collect()
 }
 
-/// The value that stands for a brick of [`Codec::Constant`]: halfway between its bounds.
-pub fn constant(values: &Brick) -> f32 {
+/// The value that stands for a brick of [`Codec::Constant`]: the background if some of it is empty, so that what is
+/// faint all over becomes empty and nothing else becomes fog, else halfway between its bounds.
+pub fn constant(values: &Brick, scale: &ChannelScale) -> f32 {
+    if values.contains(&scale.background) {
+        return scale.background;
+    }
     let (min, max) = bounds(values.iter().copied());
     // A sum of halves does not overflow.
     (0.5 * min + 0.5 * max).clamp(min, max)
@@ -132,9 +152,49 @@ pub fn write(values: &Brick, codec: Codec, scale: &ChannelScale, words: &mut Vec
             let pairs = values.as_chunks::<2>().0;
             words.extend(pairs.iter().map(|[low, high]| half(*low) | half(*high) << 16));
         }
+        Codec::Split { bits } => {
+            let split = Split::over(values, scale, bits);
+            let last_code = f32::from((1_u16 << bits) - 1);
+            let inverses = split.lines.map(inverse);
+            words.push(split.word);
+            words.extend(split.bounds);
+            let code = |i: usize| {
+                let octant = octant_of(i);
+                code_of(values[i], 0.0, split.lines[octant], inverses[octant], last_code, scale.floor) as u8
+            };
+            codes::pack(bits, &std::array::from_fn(code), words);
+        }
         Codec::Block { .. } => write_block(values, codec, scale, words),
         Codec::F32 => words.extend(values.iter().map(|value| value.to_bits())),
         Codec::Shared => unreachable!("a shared brick needs a shape"),
+    }
+}
+
+/// The bounds of the octants of a brick.
+struct Split {
+    word: u32,
+    bounds: [u32; 4],
+    lines: [Line; 8],
+}
+
+impl Split {
+    fn over(values: &Brick, scale: &ChannelScale, bits: u8) -> Split {
+        let (mut mins, mut maxs) = ([f32::INFINITY; 8], [f32::NEG_INFINITY; 8]);
+        for (i, value) in values.iter().enumerate() {
+            let octant = octant_of(i);
+            mins[octant] = if *value < mins[octant] { *value } else { mins[octant] };
+            maxs[octant] = if *value > maxs[octant] { *value } else { maxs[octant] };
+        }
+        let (min, max) = (bounds(mins.into_iter()).0, bounds(maxs.into_iter()).1);
+        let StoredLine { line, word } = StoredLine::covering(min, max, 255, scale.unit);
+        let inverse = inverse(line);
+        let mut octants = [0; 4];
+        for i in 0..8 {
+            let low = ((mins[i] - line.low) * inverse).floor().clamp(0.0, 255.0) as u32;
+            let high = ((maxs[i] - line.low) * inverse).ceil().clamp(0.0, 255.0) as u32;
+            octants[i / 2] |= (low | high << 8) << (i % 2 * 16);
+        }
+        Split { word, bounds: octants, lines: octant_lines(octants, line, bits) }
     }
 }
 
@@ -425,7 +485,7 @@ mod tests {
                 let mut words = Vec::new();
                 write(&values, codec, &scale, &mut words);
                 prop_assert_eq!(words.len(), codec.word_count());
-                let mut decoded = [constant(&values); BRICK_VOXELS];
+                let mut decoded = [constant(&values, &scale); BRICK_VOXELS];
                 if codec != Codec::Constant {
                     prop_assert!(decode(codec, &words, &scale, &mut decoded));
                 }

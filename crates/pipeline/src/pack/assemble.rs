@@ -15,7 +15,7 @@ use nuage_volume::packed::TreeRef;
 use nuage_volume::packed::build::{EntryScale, Packer, TooLarge};
 use nuage_volume::space::BRICK_VOXELS;
 
-use super::frame::{Bound, EncodedFrame, EncodedLevel, Options, map};
+use super::frame::{EncodedFrame, EncodedLevel, Options, map};
 use super::plan::Plan;
 use crate::encode::quantize::ChannelScale;
 
@@ -46,8 +46,8 @@ pub struct Report {
     pub brick_bytes: u64,
     /// The entries of all nodes.
     pub entries: u64,
-    /// The bricks of the finest levels, each as often as it is used.
-    pub bricks_used: u64,
+    /// The bricks of the sources that are not constant, over all frames and channels.
+    pub source_bricks: u64,
     /// The bricks that are stored, of all levels.
     pub bricks_stored: u64,
 }
@@ -60,7 +60,7 @@ pub struct Assembler<'c, W: Write + Seek> {
     /// Where each brick stands, by a digest of its codec and words.
     bricks: HashMap<u128, u32>,
     stored_words: u64,
-    bricks_used: u64,
+    source_bricks: u64,
 }
 
 impl<'c, W: Write + Seek> Assembler<'c, W> {
@@ -86,10 +86,7 @@ impl<'c, W: Write + Seek> Assembler<'c, W> {
                 floor: scale.floor,
                 peak,
                 quality: Quality::default(),
-                asked_max_error: options.max_error.map(|bound| match bound {
-                    Bound::Absolute(error) => error,
-                    Bound::OfPeak(part) => part * peak,
-                }),
+                asked_max_error: options.max_error.map(|bound| bound.of(peak)),
                 asked_psnr: options.psnr,
             }
         };
@@ -100,7 +97,7 @@ impl<'c, W: Write + Seek> Assembler<'c, W> {
             contents: Contents { frame_rate, channels, frames: Vec::new() },
             bricks: HashMap::new(),
             stored_words: 0,
-            bricks_used: 0,
+            source_bricks: 0,
         })
     }
 
@@ -118,7 +115,7 @@ impl<'c, W: Write + Seek> Assembler<'c, W> {
         for grid in &frame.grids {
             let levels = grid.levels.iter().map(|level| self.add_level(level, &grid.scale));
             let levels = levels.collect::<Result<_, _>>()?;
-            self.bricks_used += grid.levels.first().map_or(0, |level| level.bricks.len()) as u64;
+            self.source_bricks += grid.source_bricks;
             let quality = &mut self.contents.channels[grid.channel].quality;
             quality.max_error = quality.max_error.max(grid.quality.max_error);
             quality.squared_error += grid.quality.squared_error;
@@ -192,7 +189,7 @@ impl<'c, W: Write + Seek> Assembler<'c, W> {
             tree_bytes: trees.size_bytes() as u64,
             brick_bytes: 4 * self.stored_words,
             entries: trees.entries.len() as u64,
-            bricks_used: self.bricks_used,
+            source_bricks: self.source_bricks,
             bricks_stored: self.bricks.len() as u64,
             contents: self.contents,
         })

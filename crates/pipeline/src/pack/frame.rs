@@ -12,8 +12,8 @@ use nuage_volume::codec::Codec;
 use nuage_volume::format::Quality;
 
 use super::level::{Level, Tile};
-use super::plan::{ChannelTree, Plan, channel_trees};
-use crate::encode::choose::{Target, choose};
+use super::plan::{ChannelPlan, ChannelTree, Plan, channel_trees};
+use crate::encode::choose::{Lambda, Target, Totals, choose};
 use crate::encode::quantize::{CODECS, ChannelScale, constant, measure, write};
 use crate::import::linear_transform;
 
@@ -26,14 +26,24 @@ pub enum Bound {
     OfPeak(f32),
 }
 
+impl Bound {
+    /// The error in the numbers of a channel with this peak.
+    pub fn of(self, peak: f32) -> f32 {
+        match self {
+            Bound::Absolute(error) => error,
+            Bound::OfPeak(part) => part * peak,
+        }
+    }
+}
+
 /// What is asked of a packed volume.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Options {
     /// The largest error of any voxel.
     pub max_error: Option<Bound>,
-    /// The least ratio of a channel's peak over all frames to its error, in every frame, in dB.
+    /// The least ratio of a channel's peak to its error over all frames, in dB.
     pub psnr: Option<f64>,
-    /// The most bits per voxel of bricks that are not constant, in every frame.
+    /// The most bits per voxel of bricks that are not constant, over all frames, entries included.
     pub bits_per_voxel: Option<f64>,
     /// One codec for all bricks that it can hold, whatever the error.
     pub codec: Option<Codec>,
@@ -79,6 +89,8 @@ pub struct EncodedGrid {
     pub source_header: Vec<u8>,
     /// The error of the finest level.
     pub quality: Quality,
+    /// The bricks of the source that are not constant.
+    pub source_bricks: u64,
 }
 
 /// A level of a channel.
@@ -136,30 +148,16 @@ fn encode_channel(
     let index = plan.find(&key).ok_or_else(|| EncodeError::NotPlanned(key.grid.clone()))?;
     let planned = &plan.channels[index];
     let scale = planned.scale(tree.background);
-    let peak = planned.peak();
+    let choice = Choice::new(planned, options);
     let offset = index_offset(&tree);
     let mut level = Level::of(&tree, offset >> 3);
-    let voxels = level.voxels(tree.background);
-    let target = |level: &Level, voxels: u64| Target {
-        max_error: options.max_error.filter(|_| options.codec.is_none()).map(|bound| match bound {
-            Bound::Absolute(error) => error,
-            Bound::OfPeak(part) => part * peak,
-        }),
-        squared_error: options
-            .psnr
-            .map(|decibels| voxels as f64 * f64::from(peak).powi(2) / 10.0_f64.powf(decibels / 10.0)),
-        words: options.bits_per_voxel.map(|bits| (bits * 16.0 * level.bricks.len() as f64) as u64),
-    };
-    // A codec that is asked for is not weighed against others; what it cannot hold is kept as it is.
-    let forced = options.codec.map(|codec| [codec, Codec::Uniform { bits: 8 }, Codec::F32]);
-    let codecs: &[Codec] = forced.as_ref().map_or(&CODECS, |forced| forced);
-    let (encoded, error) = encode_level(&level, codecs, &scale, &target(&level, voxels));
+    let (voxels, source_bricks) = (level.voxels(tree.background), level.bricks.len() as u64);
+    let (encoded, error) = encode_level(&level, &scale, &choice);
     let mut levels = vec![encoded];
     for _ in 0..options.coarser_levels {
         let Some(coarser) = level.coarser(tree.background) else { break };
         level = coarser;
-        let voxels = level.voxels(tree.background);
-        levels.push(encode_level(&level, codecs, &scale, &target(&level, voxels)).0);
+        levels.push(encode_level(&level, &scale, &choice).0);
     }
     let world_from_index =
         linear_transform(&grid.name, &grid.transform).ok().map(|affine| affine.to_cols_array());
@@ -172,6 +170,7 @@ fn encode_channel(
         world_from_index,
         source_header: source_header(grid, metadata)?,
         quality: Quality { max_error: error.1, squared_error: error.0, voxels },
+        source_bricks,
     })
 }
 
@@ -209,30 +208,114 @@ fn source_header(grid: &Grid, metadata: &Metadata) -> Result<Vec<u8>, EncodeErro
     Ok(bytes)
 }
 
+/// What decides which codec a brick gets.
+struct Choice {
+    codecs: Vec<Codec>,
+    max_error: Option<f32>,
+    lambda: Lambda,
+}
+
+impl Choice {
+    fn new(planned: &ChannelPlan, options: &Options) -> Choice {
+        match options.codec {
+            // A codec that is asked for is not weighed against others; what it cannot hold takes more.
+            Some(codec) => {
+                let codecs = vec![codec, Codec::Uniform { bits: 8 }, Codec::F32];
+                Choice { codecs, max_error: None, lambda: Lambda::NONE }
+            }
+            None => Choice {
+                codecs: CODECS.to_vec(),
+                max_error: options.max_error.map(|bound| bound.of(planned.peak())),
+                lambda: planned.lambda,
+            },
+        }
+    }
+}
+
+/// What each weight of error leads to in one channel of a frame.
+#[derive(Debug, Clone)]
+pub struct ChannelTotals {
+    /// The index of the channel in the plan.
+    pub channel: usize,
+    /// Words and errors.
+    pub totals: Totals,
+    /// Voxels that are not background.
+    pub voxels: u64,
+    /// Bricks that are not constant.
+    pub bricks: u64,
+}
+
+/// The words that the tree takes for a brick: an entry of two, and its part of nodes, masks and entries that are no
+/// bricks.
+const ENTRY_WORDS: f64 = 3.0;
+
+impl ChannelTotals {
+    /// Adds what another frame has.
+    pub fn merge(&mut self, other: &ChannelTotals) {
+        self.totals.merge(&other.totals);
+        self.voxels += other.voxels;
+        self.bricks += other.bricks;
+    }
+
+    /// The weight with which the channel meets what is asked of it.
+    pub fn lambda(&self, planned: &ChannelPlan, options: &Options) -> Lambda {
+        let peak = f64::from(planned.peak());
+        let target = Target {
+            squared_error: options
+                .psnr
+                .map(|decibels| self.voxels as f64 * peak.powi(2) / 10.0_f64.powf(decibels / 10.0)),
+            words: options
+                .bits_per_voxel
+                .map(|bits| ((bits * 16.0 - ENTRY_WORDS) * self.bricks as f64).max(0.0) as u64),
+        };
+        self.totals.lambda(&target, planned.scale(0.0).unit)
+    }
+}
+
+/// Adds up what each weight of error would lead to in a frame.
+pub fn frame_totals(grids: &[Grid], plan: &Plan, options: &Options) -> Vec<ChannelTotals> {
+    let total = |channel: ChannelTree| {
+        let index = plan.find(&channel.key)?;
+        let planned = &plan.channels[index];
+        let scale = planned.scale(channel.tree.background);
+        let Choice { codecs, max_error, .. } = Choice::new(planned, options);
+        let level = Level::of(&channel.tree, IVec3::ZERO);
+        let parts: Vec<_> = level.bricks.chunks(512).collect();
+        // Parts and not bricks, since sums depend on their order.
+        let totals = map(&parts, |bricks| {
+            let mut totals = Totals::default();
+            for brick in *bricks {
+                totals.add(&codecs, &measure(brick, &codecs, &scale), max_error, scale.unit);
+            }
+            totals
+        });
+        let mut sum = Totals::default();
+        totals.iter().for_each(|totals| sum.merge(totals));
+        let (voxels, bricks) = (level.voxels(channel.tree.background), level.bricks.len() as u64);
+        Some(ChannelTotals { channel: index, totals: sum, voxels, bricks })
+    };
+    channel_trees(grids).0.into_iter().filter_map(total).collect()
+}
+
 /// Encodes the bricks of a level. Gives the sum of their squared errors and the largest error as well.
-fn encode_level(
-    level: &Level,
-    codecs: &[Codec],
-    scale: &ChannelScale,
-    target: &Target,
-) -> (EncodedLevel, (f64, f32)) {
-    let errors = map(&level.bricks, |brick| measure(brick, codecs, scale));
-    let chosen = choose(codecs, &errors, target);
-    let items: Vec<_> = level.bricks.iter().zip(&chosen).collect();
-    let written = map(&items, |(brick, i)| {
-        let mut words = Vec::with_capacity(codecs[**i].word_count());
-        write(brick, codecs[**i], scale, &mut words);
-        words
+fn encode_level(level: &Level, scale: &ChannelScale, choice: &Choice) -> (EncodedLevel, (f64, f32)) {
+    let Choice { codecs, max_error, lambda } = choice;
+    let coded = map(&level.bricks, |brick| {
+        let errors = measure(brick, codecs, scale);
+        let i = choose(codecs, &errors, *max_error, *lambda);
+        let mut words = Vec::with_capacity(codecs[i].word_count());
+        write(brick, codecs[i], scale, &mut words);
+        (codecs[i], errors[i], words)
     });
     let mut encoded = EncodedLevel { tiles: level.tiles.clone(), ..EncodedLevel::default() };
     let mut total = (0.0, 0.0_f32);
-    for (n, ((place, i), words)) in level.places.iter().zip(&chosen).zip(written).enumerate() {
-        if let Some(error) = errors[n][*i] {
+    for ((place, brick), (codec, error, words)) in level.places.iter().zip(&level.bricks).zip(coded) {
+        if let Some(error) = error {
             total = (total.0 + f64::from(error.squared), total.1.max(error.max));
         }
-        match codecs[*i] {
+        match codec {
             Codec::Constant => {
-                let value = constant(&level.bricks[n]);
+                let value = constant(brick, scale);
                 if value != scale.background {
                     encoded.tiles.push((*place, TileSize::Brick, value));
                 }

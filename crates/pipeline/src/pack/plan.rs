@@ -4,6 +4,7 @@ use nuage_vdb::{AnyTree, Grid, Shape, Tree};
 use nuage_volume::format::Role;
 use rayon_or_not::map_slice;
 
+use crate::encode::choose::Lambda;
 use crate::encode::quantize::ChannelScale;
 
 /// Values beyond this count as this: twice as much is still a float, and a power of two above it is.
@@ -34,6 +35,8 @@ pub struct ChannelPlan {
     pub min: f32,
     /// The largest value over all frames, the background included.
     pub max: f32,
+    /// The weight of errors with which the channel meets what is asked of it.
+    pub lambda: Lambda,
 }
 
 /// The channels of a sequence, in the order in which they were met.
@@ -83,7 +86,7 @@ impl Plan {
         let (trees, left_out) = channel_trees(grids);
         let channels = trees.into_iter().map(|ChannelTree { key, grid, tree }| {
             let (min, max) = range(&tree);
-            ChannelPlan { key, role: role(&grids[grid]), min, max }
+            ChannelPlan { key, role: role(&grids[grid]), min, max, lambda: Lambda::NONE }
         });
         self.merge(Plan { channels: channels.collect(), left_out });
     }

@@ -1,15 +1,18 @@
-//! Packing a sequence: all its frames, looked through once and then encoded, a few at a time.
+//! Packing a sequence: all its frames, looked through for their range, weighed for what errors cost if a ratio or a size
+//! is asked for, and then encoded, a few at a time.
 //!
 //! Memory holds as many frames as there are threads, the trees and a digest of each brick. What comes out does not
 //! depend on the number of threads.
 
+use std::borrow::Cow;
 use std::io::{Seek, Write};
 
 use nuage_vdb::{Grid, Metadata};
 
 use super::assemble::{AssembleError, Assembler, Report};
-use super::frame::{EncodeError, EncodedFrame, Options, encode_frame};
+use super::frame::{ChannelTotals, EncodeError, EncodedFrame, Options, encode_frame, frame_totals};
 use super::plan::Plan;
+use crate::encode::choose::Lambda;
 
 /// A frame's number, if it has one, and the name of its source.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -38,7 +41,7 @@ pub enum PackError<E> {
 }
 
 /// Packs the frames that `load` gives, by their index, into `out`. `done` is told of each frame that is finished, in
-/// either of the two passes, as a part of the whole.
+/// any of the passes, as a part of the whole.
 ///
 /// # Errors
 /// If a frame cannot be loaded or encoded, or the file not written.
@@ -50,42 +53,65 @@ pub fn pack<E: Send, W: Write + Seek>(
     frame_rate: Option<f64>,
     done: &mut dyn FnMut(f64),
 ) -> Result<(Report, Plan), PackError<E>> {
-    let steps = 2 * frames.len();
-    let mut plan = Plan::default();
     // A still is loaded once.
-    let mut kept = None;
+    let kept = match frames.len() {
+        1 => Some(load(0).map_err(PackError::Load)?),
+        _ => None,
+    };
+    let with_frame = |frame: usize| match &kept {
+        Some(kept) => Ok(Cow::Borrowed(kept)),
+        None => load(frame).map(Cow::Owned).map_err(PackError::Load),
+    };
+    let is_weighed = options.codec.is_none() && (options.psnr.is_some() || options.bits_per_voxel.is_some());
+    let passes = if is_weighed { 3 } else { 2 };
+    let mut finished = 0;
+    let mut tell = |count: usize| {
+        finished += count;
+        done(finished as f64 / (passes * frames.len()) as f64);
+    };
+
+    let mut plan = Plan::default();
     for window in windows(frames.len()) {
-        let looked = each(window.clone(), |frame| {
-            let loaded = load(frame)?;
+        let looked = each(window.clone(), |frame| -> Result<Plan, PackError<E>> {
             let mut plan = Plan::default();
-            plan.note(&loaded.0);
-            Ok((plan, (frames.len() == 1).then_some(loaded)))
+            plan.note(&with_frame(frame)?.0);
+            Ok(plan)
         });
-        for result in looked {
-            let (found, loaded) = result.map_err(PackError::Load)?;
-            plan.merge(found);
-            kept = loaded;
+        looked.into_iter().try_for_each(|found| found.map(|found| plan.merge(found)))?;
+        tell(window.len());
+    }
+    if is_weighed {
+        let mut sums: Vec<Option<ChannelTotals>> = vec![None; plan.channels.len()];
+        for window in windows(frames.len()) {
+            let weighed = each(window.clone(), |frame| -> Result<_, PackError<E>> {
+                Ok(frame_totals(&with_frame(frame)?.0, &plan, options))
+            });
+            for totals in weighed {
+                for found in totals? {
+                    let sum = &mut sums[found.channel];
+                    match sum {
+                        Some(sum) => sum.merge(&found),
+                        None => *sum = Some(found),
+                    }
+                }
+            }
+            tell(window.len());
         }
-        done(window.end as f64 / steps as f64);
+        for (channel, sum) in plan.channels.iter_mut().zip(sums) {
+            channel.lambda = sum.map_or(Lambda::NONE, |sum| sum.lambda(channel, options));
+        }
     }
     let compress = |bytes: &[u8]| compress(bytes);
     let mut assembler = Assembler::new(out, &compress, &plan, options, frame_rate)?;
     for window in windows(frames.len()) {
         let encoded = each(window.clone(), |frame| -> Result<EncodedFrame, PackError<E>> {
-            let loaded;
-            let (grids, metadata) = match &kept {
-                Some(kept) => kept,
-                None => {
-                    loaded = load(frame).map_err(PackError::Load)?;
-                    &loaded
-                }
-            };
-            Ok(encode_frame(grids, metadata, &plan, options)?)
+            let loaded = with_frame(frame)?;
+            Ok(encode_frame(&loaded.0, &loaded.1, &plan, options)?)
         });
         for (frame, encoded) in window.clone().zip(encoded) {
             assembler.add(&encoded?, frames[frame].number, &frames[frame].name)?;
         }
-        done((frames.len() + window.end) as f64 / steps as f64);
+        tell(window.len());
     }
     Ok((assembler.finish()?, plan))
 }

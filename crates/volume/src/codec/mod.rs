@@ -39,6 +39,14 @@ pub enum Codec {
         /// The bits of a code, 0 to 8.
         bits: u8,
     },
+    /// Codes of 1 to 8 bits between bounds of each octant of 4³ voxels: a word as in [`Codec::Uniform`], then, in four
+    /// words, an 8-bit code of the lower bound of each octant `x << 2 | y << 1 | z` and one of its upper bound, two to a
+    /// half word, the lower first; then the words of codes. A line of its own leads from one
+    /// bound to the other: its step is their difference over the largest code.
+    Split {
+        /// The bits of a code.
+        bits: u8,
+    },
     /// The values of a shape, scaled: a word with bias and scale, both half floats in units (the shape's own values count
     /// as they are); the shape's offset in the shape store; the tag of its codec. A shape is stored as a brick is, and
     /// is not shared itself.
@@ -79,6 +87,7 @@ impl Codec {
                 };
                 first + axis
             }
+            Codec::Split { bits } => 43 + bits,
         }
     }
 
@@ -95,6 +104,7 @@ impl Codec {
                 let (format, axis) = (usize::from(tag - 32) / 4, usize::from(tag) % 4);
                 Some(Codec::Block { format: FORMATS[format], axis: *AXES.get(axis)? })
             }
+            44..=51 => Some(Codec::Split { bits: tag - 43 }),
             _ => None,
         }
     }
@@ -108,6 +118,7 @@ impl Codec {
             Codec::Uniform { bits } => 1 + codes::word_count(bits),
             Codec::Gradient { bits: 0 } => 3,
             Codec::Gradient { bits } => 4 + codes::word_count(bits),
+            Codec::Split { bits } => 5 + codes::word_count(bits),
             Codec::Shared => 3,
             Codec::Block { format, .. } => 1 + format.brick_bytes() / 4,
         }
@@ -194,6 +205,21 @@ pub fn interpolate_corners(corners: &[f32; 8], out: &mut [f32; BRICK_VOXELS]) {
     }
 }
 
+/// The octant of a voxel.
+pub fn octant_of(voxel: usize) -> usize {
+    voxel >> 8 & 1 << 2 | voxel >> 5 & 1 << 1 | voxel >> 2 & 1
+}
+
+/// The lines of the codes of each octant of [`Codec::Split`], from the words of their bounds.
+pub fn octant_lines(bounds: [u32; 4], line: Line, bits: u8) -> [Line; 8] {
+    let last = f32::from((1_u16 << bits.min(8)) - 1);
+    std::array::from_fn(|i| {
+        let both = bounds[i / 2] >> (i % 2 * 16);
+        let (low, high) = (line.at(both & 0xff), line.at(both >> 8 & 0xff));
+        Line { low, step: (high - low) / last }
+    })
+}
+
 impl BrickContext<'_> {
     /// Decodes a brick that is not [`Codec::Constant`].
     ///
@@ -250,6 +276,13 @@ impl BrickContext<'_> {
                     codes::unpack(bits, words, out, |predicted, code| predicted + line.at(code));
                 }
             }
+            (Codec::Split { bits }, [line, b0, b1, b2, b3, words @ ..]) => {
+                let line = Line::from_word(*line, self.unit)?;
+                let octants = octant_lines([*b0, *b1, *b2, *b3], line, bits);
+                // Each voxel is given its octant first, which then becomes its value.
+                out.iter_mut().enumerate().for_each(|(i, value)| *value = octant_of(i) as f32);
+                codes::unpack(bits, words, out, |octant, code| octants[octant as usize & 7].at(code));
+            }
             (Codec::Block { format, axis }, [line, words @ ..]) => {
                 let line = Line::from_word(*line, self.unit)?;
                 let mut bytes = [0; 256];
@@ -282,7 +315,7 @@ mod tests {
     #[test]
     fn tags_and_codecs_are_inverse() {
         let all: Vec<Codec> = (0..=255).filter_map(Codec::from_tag).collect();
-        assert_eq!(all.len(), 30);
+        assert_eq!(all.len(), 38);
         for (i, codec) in all.iter().enumerate() {
             assert_eq!(Codec::from_tag(codec.tag()), Some(*codec));
             assert!(!all[..i].contains(codec));

@@ -1,6 +1,6 @@
 //! The file format of packed volumes, `.nuage`: contents, trees and bricks in checked, compressed chunks.
 //!
-//! From the bottom up: [`source`] (where bytes come from), `layout` (header, table of contents, one chunk), `predict` and
+//! From the bottom up: [`source`] (where bytes come from), `layout` (header, table of contents, one chunk), `predict`, `entropy` and
 //! `page` (the words of bricks), `arrays` (those of trees), [`contents`] (channels and frames), [`mod@read`] and
 //! [`mod@write`]. The specification is `docs/format.md`.
 //!
@@ -9,6 +9,7 @@
 mod arrays;
 mod check;
 pub mod contents;
+mod entropy;
 mod error;
 mod layout;
 mod page;

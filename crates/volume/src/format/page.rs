@@ -6,12 +6,16 @@
 //!
 //! Which bricks a page holds is [`crate::packed::store`]'s; compression is [`super::chunk`]'s.
 
+use super::entropy;
 use super::predict::{Number, Predictor, residuals, restore};
 use crate::codec::{Codec, codes};
 use crate::space::BRICK_VOXELS;
 
 /// One more than the largest tag of a codec.
-const TAGS: usize = 43;
+const TAGS: usize = 52;
+
+/// The number of [`Mode::Coded`].
+const CODED: u8 = 1 + Predictor::ALL.len() as u8;
 
 /// How the values of all bricks of a codec are stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -20,6 +24,8 @@ enum Mode {
     Words,
     /// Residuals: a byte each if they are codes, in byte planes if they are floats.
     Predicted(Predictor),
+    /// Entropy-coded codes: their length in four bytes, then those.
+    Coded,
 }
 
 impl Mode {
@@ -27,12 +33,14 @@ impl Mode {
         match self {
             Mode::Words => 0,
             Mode::Predicted(predictor) => 1 + predictor as u8,
+            Mode::Coded => CODED,
         }
     }
 
     fn from_number(number: u8) -> Option<Mode> {
         match number.checked_sub(1) {
             None => Some(Mode::Words),
+            _ if number == CODED => Some(Mode::Coded),
             Some(predictor) => Predictor::ALL.get(usize::from(predictor)).copied().map(Mode::Predicted),
         }
     }
@@ -43,7 +51,8 @@ const LINES: usize = 0;
 const CORNERS: usize = 1;
 const SHAPE_OFFSETS: usize = 2;
 const SHAPE_TAGS: usize = 3;
-const HEAD_STREAMS: usize = 4;
+const OCTANTS: usize = 4;
+const HEAD_STREAMS: usize = 5;
 
 /// Which streams the first words of a brick go to.
 fn head(codec: Codec) -> &'static [usize] {
@@ -52,6 +61,7 @@ fn head(codec: Codec) -> &'static [usize] {
         Codec::Uniform { .. } | Codec::Block { .. } => &[LINES],
         Codec::Gradient { bits: 0 } => &[LINES, CORNERS, CORNERS],
         Codec::Gradient { .. } => &[LINES, CORNERS, CORNERS, LINES],
+        Codec::Split { .. } => &[LINES, OCTANTS, OCTANTS, OCTANTS, OCTANTS],
         Codec::Shared => &[LINES, SHAPE_OFFSETS, SHAPE_TAGS],
     }
 }
@@ -71,7 +81,7 @@ impl Values {
     fn of(codec: Codec) -> Values {
         match codec {
             Codec::Constant | Codec::Shared | Codec::Gradient { bits: 0 } => Values::None,
-            Codec::Uniform { bits } | Codec::Gradient { bits } => Values::Codes(bits),
+            Codec::Uniform { bits } | Codec::Gradient { bits } | Codec::Split { bits } => Values::Codes(bits),
             Codec::Block { .. } => Values::Blocks(codec.word_count() - 1),
             Codec::F16 => Values::Halves,
             Codec::F32 => Values::Floats,
@@ -86,24 +96,34 @@ impl Values {
         }
     }
 
-    /// The bytes of so many bricks' values in a stream.
-    fn stored_bytes(self, mode: Mode, bricks: usize) -> usize {
-        bricks
-            * match (self, mode) {
-                (Values::None, _) => 0,
-                (Values::Codes(_), Mode::Predicted(_)) => BRICK_VOXELS,
-                (Values::Codes(bits), Mode::Words) => 4 * codes::word_count(bits),
-                (Values::Blocks(words), _) => 4 * words,
-                (Values::Halves, _) => 2 * BRICK_VOXELS,
-                (Values::Floats, _) => 4 * BRICK_VOXELS,
-            }
+    /// Takes the bytes of so many bricks' values. `None` if they are not there.
+    fn take<'a>(self, mode: Mode, bricks: usize, rest: &mut &'a [u8]) -> Option<&'a [u8]> {
+        let len = match (self, mode) {
+            (_, Mode::Coded) if bricks == 0 => 0,
+            (_, Mode::Coded) => u32::from_le_bytes(*rest.split_off(..4)?.first_chunk()?) as usize,
+            _ => bricks * self.brick_bytes(mode),
+        };
+        rest.split_off(..len)
+    }
+
+    /// The bytes of a brick's values in a stream.
+    fn brick_bytes(self, mode: Mode) -> usize {
+        match (self, mode) {
+            (Values::None, _) => 0,
+            (Values::Codes(_), Mode::Predicted(_)) => BRICK_VOXELS,
+            (Values::Codes(bits), Mode::Words | Mode::Coded) => 4 * codes::word_count(bits),
+            (Values::Blocks(words), _) => 4 * words,
+            (Values::Halves, _) => 2 * BRICK_VOXELS,
+            (Values::Floats, _) => 4 * BRICK_VOXELS,
+        }
     }
 }
 
 /// The most bytes that the words of such bricks become.
 pub(super) fn max_encoded_bytes(codecs: &[Codec]) -> u64 {
     let bytes = |codec: &Codec| (4 * codec.word_count() + BRICK_VOXELS) as u64;
-    codecs.iter().map(bytes).sum::<u64>() + TAGS as u64
+    // A mode for each tag, and at most a length.
+    codecs.iter().map(bytes).sum::<u64>() + 5 * TAGS as u64
 }
 
 /// The bytes of the words of some bricks, one after the other.
@@ -123,13 +143,19 @@ pub(super) fn encode(codecs: &[Codec], words: &[u32]) -> Vec<u8> {
     for (tag, words) in values.iter().enumerate() {
         let Some(codec) = Codec::from_tag(tag as u8).filter(|_| !words.is_empty()) else { continue };
         let values = Values::of(codec);
-        // Measured on clouds: a byte for a code of one or two bits never pays, however well it is predicted.
+        // Measured on clouds: a byte for a code of one or two bits never pays, however well it is predicted. What is
+        // not entropy-coded here is so by whoever compresses the page.
         let modes = match values {
-            Values::Codes(..=2) | Values::Blocks(_) => vec![Mode::Words],
+            Values::Codes(..=2) => vec![Mode::Coded, Mode::Words],
+            Values::Codes(_) => [&[Mode::Coded][..], &Predictor::ALL.map(Mode::Predicted)].concat(),
+            Values::Blocks(_) => vec![Mode::Words],
             _ => Predictor::ALL.map(Mode::Predicted).to_vec(),
         };
         let candidates = modes.into_iter().map(|mode| (mode, encode_values(values, mode, words)));
-        let best = candidates.min_by_key(|(_, bytes)| entropy_bits(bytes, values.plane_count()));
+        let best = candidates.min_by_key(|(mode, bytes)| match mode {
+            Mode::Coded => 8 * bytes.len() as u64,
+            _ => entropy_bits(bytes, values.plane_count()),
+        });
         if let Some((mode, bytes)) = best {
             out[tag] = mode.number();
             out.extend(bytes);
@@ -146,16 +172,16 @@ pub(super) fn decode(codecs: &[Codec], bytes: &[u8]) -> Option<Vec<u32>> {
         head(*codec).iter().for_each(|stream| head_counts[*stream] += 1);
         brick_counts[usize::from(codec.tag())] += 1;
     }
-    let mut take = |len: usize| rest.split_off(..len);
     let mut heads = [const { Planes::<4>::NONE }; HEAD_STREAMS];
     for (head, count) in heads.iter_mut().zip(head_counts) {
-        *head = Planes::new(take(4 * count)?);
+        *head = Planes::new(rest.split_off(..4 * count)?);
     }
     let mut streams = [const { None }; TAGS];
     for (tag, stream) in streams.iter_mut().enumerate() {
         let Some(codec) = Codec::from_tag(tag as u8) else { continue };
         let (mode, values) = (Mode::from_number(modes[tag])?, Values::of(codec));
-        *stream = Some(Stream::new(values, mode, take(values.stored_bytes(mode, brick_counts[tag]))?));
+        let bytes = values.take(mode, brick_counts[tag], &mut rest)?;
+        *stream = Some(Stream::new(values, mode, brick_counts[tag], bytes)?);
     }
     if !rest.is_empty() {
         return None;
@@ -176,6 +202,13 @@ fn encode_values(values: Values, mode: Mode, words: &[u32]) -> Vec<u8> {
         (Values::None, _) => Vec::new(),
         (Values::Codes(_), Mode::Words) | (Values::Blocks(_), _) => {
             words.iter().flat_map(|word| word.to_le_bytes()).collect()
+        }
+        (Values::Codes(bits), Mode::Coded) => {
+            let bricks = words.chunks(codes::word_count(bits));
+            let codes: Vec<[u8; BRICK_VOXELS]> =
+                bricks.map(|brick| std::array::from_fn(|i| codes::code(bits, brick, i) as u8)).collect();
+            let coded = entropy::encode(bits, &codes);
+            [&(coded.len() as u32).to_le_bytes()[..], &coded].concat()
         }
         (Values::Codes(bits), Mode::Predicted(predictor)) => {
             let mut bytes = Vec::with_capacity(words.len() / usize::from(bits) * 32);
@@ -216,13 +249,20 @@ enum Stream<'a> {
     None,
     Packed { brick_bytes: usize, bytes: &'a [u8] },
     Codes { bits: u8, predictor: Predictor, bytes: &'a [u8] },
+    Coded { bits: u8, decoder: Box<entropy::Decoder<'a>> },
     Halves { mode: Mode, planes: Planes<'a, 2> },
     Floats { mode: Mode, planes: Planes<'a, 4> },
 }
 
 impl<'a> Stream<'a> {
-    fn new(values: Values, mode: Mode, bytes: &'a [u8]) -> Stream<'a> {
-        match (values, mode) {
+    /// The values of so many bricks. `None` if they are damaged, or the mode is not one of such values.
+    fn new(values: Values, mode: Mode, bricks: usize, bytes: &'a [u8]) -> Option<Stream<'a>> {
+        let stream = match (values, mode) {
+            _ if bricks == 0 => Stream::None,
+            (Values::Codes(bits), Mode::Coded) => {
+                Stream::Coded { bits, decoder: Box::new(entropy::Decoder::new(bits, bricks, bytes)?) }
+            }
+            (_, Mode::Coded) => return None,
             (Values::None, _) => Stream::None,
             (Values::Codes(bits), Mode::Words) => {
                 Stream::Packed { brick_bytes: 4 * codes::word_count(bits), bytes }
@@ -231,7 +271,8 @@ impl<'a> Stream<'a> {
             (Values::Codes(bits), Mode::Predicted(predictor)) => Stream::Codes { bits, predictor, bytes },
             (Values::Halves, mode) => Stream::Halves { mode, planes: Planes::new(bytes) },
             (Values::Floats, mode) => Stream::Floats { mode, planes: Planes::new(bytes) },
-        }
+        };
+        Some(stream)
     }
 
     /// Appends the words of the next brick. `None` if there is none.
@@ -242,6 +283,7 @@ impl<'a> Stream<'a> {
                 let brick = bytes.split_off(..*brick_bytes)?;
                 words.extend(brick.as_chunks().0.iter().map(|word| u32::from_le_bytes(*word)));
             }
+            Stream::Coded { bits, decoder } => codes::pack(*bits, &decoder.next_brick()?, words),
             Stream::Codes { bits, predictor, bytes } => {
                 let mut numbers: [u8; BRICK_VOXELS] = *bytes.split_off(..BRICK_VOXELS)?.first_chunk()?;
                 restore(*predictor, &mut numbers, mask(*bits));
@@ -386,7 +428,7 @@ pub(super) mod tests {
     }
 
     pub(in crate::format) fn any_codecs(len: usize) -> impl Strategy<Value = Vec<Codec>> {
-        let codec = (1_u8..25).prop_filter_map("a codec", Codec::from_tag);
+        let codec = (1_u8..52).prop_filter_map("a codec", Codec::from_tag);
         proptest::collection::vec(codec, 0..len)
     }
 
@@ -405,13 +447,17 @@ pub(super) mod tests {
         fn values_come_back_in_every_mode(tag in prop::sample::select(vec![1_u8, 2, 3, 4, 5, 6, 7, 8, 9, 10, 19]), seed in any::<u32>()) {
             let codec = Codec::from_tag(tag).unwrap();
             let values = Values::of(codec);
-            let count = values.stored_bytes(Mode::Words, 3) / 4;
+            let count = 3 * values.brick_bytes(Mode::Words) / 4;
             let words: Vec<u32> = (0..count as u32).map(|i| mixed(i ^ seed)).collect();
-            for mode in Predictor::ALL.map(Mode::Predicted).into_iter().chain([Mode::Words]) {
+            let modes = Predictor::ALL.map(Mode::Predicted).into_iter().chain([Mode::Words, Mode::Coded]);
+            for mode in modes.filter(|mode| *mode != Mode::Coded || matches!(values, Values::Codes(_))) {
                 prop_assert_eq!(Mode::from_number(mode.number()), Some(mode));
                 let bytes = encode_values(values, mode, &words);
-                prop_assert_eq!(bytes.len(), values.stored_bytes(mode, 3));
-                let mut stream = Stream::new(values, mode, &bytes);
+                let mut rest = &bytes[..];
+                let taken = values.take(mode, 3, &mut rest).unwrap();
+                prop_assert!(rest.is_empty());
+                prop_assert!(mode == Mode::Coded || taken.len() == 3 * values.brick_bytes(mode));
+                let mut stream = Stream::new(values, mode, 3, taken).unwrap();
                 let mut found = Vec::new();
                 (0..3).for_each(|_| stream.next_brick(&mut found).unwrap());
                 prop_assert_eq!(&found, &words);

@@ -1,0 +1,382 @@
+//! Entropy coding of codes: each code by what its neighbours in the brick are.
+//!
+//! In smoke a code is near the mean of those before it along x, y and z. That mean is the *context*; of each context a
+//! table says how often each symbol follows in the page, and an rANS coder (J. Duda, "Asymmetric numeral systems",
+//! arXiv:1311.2540, section 3) spends bits accordingly. The lowest bits of codes of more than five are noise, and stand as
+//! they are. Two bricks are decoded at a time, each with its own state, since every symbol has to wait for the one before
+//! it.
+//!
+//! How the bytes stand in a page is [`super::page`]'s.
+
+use crate::space::BRICK_VOXELS;
+
+/// The bits of a code that are coded by context.
+const SYMBOL_BITS: u32 = 5;
+/// Frequencies of a context add up to 2 to this.
+const SCALE_BITS: u32 = 11;
+const SCALE: u32 = 1 << SCALE_BITS;
+/// A state is at least this, and takes 16 more bits when it falls below.
+const LOW: u32 = 1 << 16;
+
+type Codes = [u8; BRICK_VOXELS];
+
+/// How the codes of some bits become symbols and contexts.
+struct Shape {
+    /// The lowest bits, which are kept as they are.
+    raw_bits: u32,
+    symbols: usize,
+    contexts: usize,
+    /// The context by the number of neighbours and their sum.
+    context: [[u8; 3 << SYMBOL_BITS]; 4],
+}
+
+impl Shape {
+    fn new(bits: u8) -> Shape {
+        let bits = u32::from(bits);
+        let raw_bits = bits.saturating_sub(SYMBOL_BITS);
+        let symbols = 1_usize << (bits - raw_bits);
+        // Without neighbours 0, else one more than twice the mean, rounded down.
+        let mean = |count: usize, sum: usize| (2 * sum).checked_div(count).map_or(0, |twice| 1 + twice as u8);
+        let context = std::array::from_fn(|count| std::array::from_fn(|sum| mean(count, sum)));
+        Shape { raw_bits, symbols, contexts: 2 * symbols, context }
+    }
+}
+
+/// The bytes of the codes of some bricks, of 1 to 8 bits each.
+pub(super) fn encode(bits: u8, bricks: &[Codes]) -> Vec<u8> {
+    let shape = Shape::new(bits);
+    // Contexts and symbols in the order in which they will be decoded.
+    let coded: Vec<Vec<(usize, u8)>> = bricks
+        .iter()
+        .map(|codes| {
+            let symbols = codes.map(|code| code >> shape.raw_bits);
+            let mut rows = Rows::default();
+            let context = |i: usize| rows.context(&shape, &symbols, i);
+            // Codes have as many bits as was said, and so a context each.
+            let contexts = (0..BRICK_VOXELS).map(context).map(Option::unwrap_or_default);
+            contexts.zip(symbols).collect()
+        })
+        .collect();
+    let mut counts = vec![vec![0_u32; shape.symbols]; shape.contexts];
+    for (context, symbol) in coded.iter().flatten() {
+        counts[*context][usize::from(*symbol)] += 1;
+    }
+    let tables: Vec<Vec<u32>> = counts.iter().map(|counts| frequencies(counts)).collect();
+    let starts: Vec<Vec<u32>> = tables.iter().map(|table| starts(table)).collect();
+
+    // An rANS coder is a stack: the last symbol is encoded first.
+    let mut words: Vec<u16> = Vec::new();
+    for pair in coded.chunks(2).rev() {
+        let mut states = [LOW; 2];
+        for i in (0..BRICK_VOXELS).rev() {
+            for (brick, state) in pair.iter().zip(&mut states).rev() {
+                let (context, symbol) = brick[i];
+                let (frequency, start) =
+                    (tables[context][usize::from(symbol)], starts[context][usize::from(symbol)]);
+                if u64::from(*state) >= u64::from(frequency) << (32 - SCALE_BITS) {
+                    words.push(*state as u16);
+                    *state >>= 16;
+                }
+                *state = (*state / frequency) << SCALE_BITS | (*state % frequency + start);
+            }
+        }
+        for state in states[..pair.len()].iter().rev() {
+            words.extend([*state as u16, (*state >> 16) as u16]);
+        }
+    }
+    words.reverse();
+
+    let mut out = Vec::new();
+    for table in &tables {
+        write_table(table, &mut out);
+    }
+    out.extend(words.iter().flat_map(|word| word.to_le_bytes()));
+    if shape.raw_bits > 0 {
+        let mut packed = Vec::new();
+        for codes in bricks {
+            let low = codes.map(|code| code & ((1 << shape.raw_bits) - 1));
+            crate::codec::codes::pack(shape.raw_bits as u8, &low, &mut packed);
+        }
+        let raw: Vec<u8> = packed.iter().flat_map(|word| word.to_le_bytes()).collect();
+        // In front, so that the words may run to the end.
+        out.splice(0..0, raw);
+    }
+    out
+}
+
+/// Frequencies that add up to [`SCALE`], none of them 0 where the count is not. All 0 if all counts are.
+fn frequencies(counts: &[u32]) -> Vec<u32> {
+    let total: u64 = counts.iter().map(|count| u64::from(*count)).sum();
+    if total == 0 {
+        return vec![0; counts.len()];
+    }
+    let share = |count: &u32| match count {
+        0 => 0,
+        count => ((u64::from(*count) * u64::from(SCALE) / total) as u32).max(1),
+    };
+    let mut table: Vec<u32> = counts.iter().map(share).collect();
+    // What rounding has added or taken away is settled where it matters least.
+    let mut sum: u32 = table.iter().sum();
+    while sum != SCALE {
+        let largest = (0..table.len()).max_by_key(|i| table[*i]).unwrap_or(0);
+        let change = if sum < SCALE { SCALE - sum } else { (sum - SCALE).min(table[largest] / 2) };
+        if sum < SCALE {
+            table[largest] += change;
+            sum += change;
+        } else {
+            table[largest] -= change;
+            sum -= change;
+        }
+    }
+    table
+}
+
+fn starts(table: &[u32]) -> Vec<u32> {
+    let mut sum = 0;
+    let start = |frequency: &u32| {
+        sum += frequency;
+        sum - frequency
+    };
+    table.iter().map(start).collect()
+}
+
+/// A table: which symbols occur, as a bit each, and the frequency of each but the last of them.
+fn write_table(table: &[u32], out: &mut Vec<u8>) {
+    let mask = (0..table.len()).filter(|i| table[*i] > 0).fold(0_u32, |mask, i| mask | 1 << i);
+    out.extend_from_slice(&mask.to_le_bytes()[..table.len().div_ceil(8)]);
+    let present: Vec<u32> = table.iter().copied().filter(|frequency| *frequency > 0).collect();
+    for frequency in present.iter().take(present.len().saturating_sub(1)) {
+        out.extend_from_slice(&(*frequency as u16).to_le_bytes());
+    }
+}
+
+fn read_table(symbols: usize, bytes: &mut &[u8]) -> Option<Vec<u32>> {
+    let mut mask = [0; 4];
+    let mask_bytes = bytes.split_off(..symbols.div_ceil(8))?;
+    mask[..mask_bytes.len()].copy_from_slice(mask_bytes);
+    let mask = u32::from_le_bytes(mask);
+    if u64::from(mask) >> symbols != 0 {
+        return None;
+    }
+    let mut table = vec![0; symbols];
+    let mut left = SCALE;
+    for symbol in (0..symbols).filter(|symbol| mask >> symbol & 1 == 1) {
+        let is_last = mask >> symbol == 1;
+        let frequency = match is_last {
+            true => left,
+            false => u32::from(u16::from_le_bytes(*bytes.split_off(..2)?.first_chunk()?)),
+        };
+        left = left.checked_sub(frequency)?;
+        // None may be 0, and the last one needs something too.
+        if frequency == 0 || (!is_last && left == 0) {
+            return None;
+        }
+        table[symbol] = frequency;
+    }
+    Some(table)
+}
+
+/// Decodes bricks one after the other.
+pub(super) struct Decoder<'a> {
+    shape: Shape,
+    /// The symbol of each part of [`SCALE`], context by context.
+    symbols: Vec<u8>,
+    /// Frequency in the upper half and start in the lower, by context and symbol.
+    ranges: Vec<u32>,
+    /// The coded words, two bytes each.
+    words: &'a [u8],
+    raw: &'a [u8],
+    bricks_left: usize,
+    /// The second brick of a pair.
+    second: Option<Codes>,
+}
+
+impl<'a> Decoder<'a> {
+    /// A decoder of `bricks` bricks of codes. `None` if the tables are damaged.
+    pub(super) fn new(bits: u8, bricks: usize, mut bytes: &'a [u8]) -> Option<Decoder<'a>> {
+        let shape = Shape::new(bits);
+        let raw = bytes.split_off(..BRICK_VOXELS / 8 * shape.raw_bits as usize * bricks)?;
+        let mut symbols = vec![0; shape.contexts << SCALE_BITS];
+        let mut ranges = vec![0; shape.contexts * shape.symbols];
+        for context in 0..shape.contexts {
+            let table = read_table(shape.symbols, &mut bytes)?;
+            let starts = starts(&table);
+            for (symbol, (frequency, start)) in table.iter().zip(&starts).enumerate() {
+                let begin = (context << SCALE_BITS) + *start as usize;
+                symbols[begin..begin + *frequency as usize].fill(symbol as u8);
+                ranges[context * shape.symbols + symbol] = frequency << 16 | start;
+            }
+        }
+        Some(Decoder { shape, symbols, ranges, words: bytes, raw, bricks_left: bricks, second: None })
+    }
+
+    /// The codes of the next brick. `None` if there is none or the words are damaged.
+    pub(super) fn next_brick(&mut self) -> Option<Codes> {
+        let mut codes = match self.second.take() {
+            Some(codes) => codes,
+            None if self.bricks_left == 0 => return None,
+            None if self.bricks_left == 1 => self.one()?,
+            None => {
+                let [first, second] = self.pair()?;
+                self.second = Some(second);
+                first
+            }
+        };
+        self.bricks_left -= 1;
+        let raw_bits = self.shape.raw_bits;
+        if raw_bits > 0 {
+            let raw = self.raw.split_off(..BRICK_VOXELS / 8 * raw_bits as usize)?;
+            let words: Vec<u32> = raw.as_chunks().0.iter().map(|word| u32::from_le_bytes(*word)).collect();
+            for (i, code) in codes.iter_mut().enumerate() {
+                *code = *code << raw_bits | crate::codec::codes::code(raw_bits as u8, &words, i) as u8;
+            }
+        }
+        Some(codes)
+    }
+
+    fn word(&mut self) -> Option<u32> {
+        let bytes = self.words.split_off(..2)?;
+        Some(u32::from(u16::from_le_bytes(*bytes.first_chunk()?)))
+    }
+
+    fn state(&mut self) -> Option<u32> {
+        Some(self.word()? << 16 | self.word()?)
+    }
+
+    fn symbol(&mut self, state: &mut u32, context: usize) -> Option<u8> {
+        let part = *state & (SCALE - 1);
+        let symbol = *self.symbols.get((context << SCALE_BITS) + part as usize)?;
+        let range = *self.ranges.get(context * self.shape.symbols + usize::from(symbol))?;
+        // Below 2³²: the frequency is at most `SCALE`. A context without a table has the range 0, and no symbol.
+        let above = (range >> 16) * (*state >> SCALE_BITS);
+        *state = above.checked_add(part)?.checked_sub(range & 0xffff).filter(|_| range >> 16 > 0)?;
+        if *state < LOW {
+            *state = *state << 16 | self.word()?;
+        }
+        Some(symbol)
+    }
+
+    fn one(&mut self) -> Option<Codes> {
+        let mut state = self.state()?;
+        let mut out = [0; BRICK_VOXELS];
+        let mut rows = Rows::default();
+        for i in 0..BRICK_VOXELS {
+            let context = rows.context(&self.shape, &out, i)?;
+            out[i] = self.symbol(&mut state, context)?;
+        }
+        Some(out)
+    }
+
+    /// Two bricks, voxel by voxel in turn: while one waits for its table, the other goes on.
+    fn pair(&mut self) -> Option<[Codes; 2]> {
+        let mut states = [self.state()?, self.state()?];
+        let mut out = [[0; BRICK_VOXELS]; 2];
+        let mut rows = [Rows::default(), Rows::default()];
+        for i in 0..BRICK_VOXELS {
+            for brick in 0..2 {
+                let context = rows[brick].context(&self.shape, &out[brick], i)?;
+                out[brick][i] = self.symbol(&mut states[brick], context)?;
+            }
+        }
+        Some(out)
+    }
+}
+
+/// What a walk through a brick keeps of the row it is in: sums of the neighbours along x and y, and how many those are.
+#[derive(Default)]
+struct Rows {
+    before: [u8; 8],
+    count: usize,
+}
+
+impl Rows {
+    /// The context of voxel `i`, when all before it are known.
+    fn context(&mut self, shape: &Shape, out: &Codes, i: usize) -> Option<usize> {
+        let (row, z) = (i / 8, i % 8);
+        if z == 0 {
+            (self.before, self.count) = ([0; 8], 0);
+            for (is_there, distance) in [(row >= 8, 64), (row % 8 > 0, 8)] {
+                if is_there {
+                    let from = i - distance;
+                    self.before.iter_mut().zip(&out[from..from + 8]).for_each(|(sum, code)| *sum += code);
+                    self.count += 1;
+                }
+            }
+        }
+        let last = if z > 0 { out[i - 1] } else { 0 };
+        let neighbours = self.count + usize::from(z > 0);
+        shape.context[neighbours & 3]
+            .get(usize::from(self.before[z] + last))
+            .map(|context| usize::from(*context))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    /// Bricks of codes that are near their neighbours.
+    fn bricks(bits: u8, count: usize, seed: u32, noise: u32) -> Vec<Codes> {
+        let largest = (1_u32 << bits) - 1;
+        let brick = |n: usize| {
+            std::array::from_fn(|i| {
+                let [x, y, z] = [i >> 6, i >> 3 & 7, i & 7].map(|c| c as u32);
+                let mixed = ((i + 512 * n) as u32 ^ seed).wrapping_mul(2_654_435_761) >> 16;
+                let slope = (x * (seed & 3) + y + z * (seed >> 2 & 3)) * largest / 40 + n as u32;
+                ((slope + if noise > 0 { mixed % noise } else { 0 }) % (largest + 1)) as u8
+            })
+        };
+        (0..count).map(brick).collect()
+    }
+
+    fn decode(bits: u8, count: usize, bytes: &[u8]) -> Option<Vec<Codes>> {
+        let mut decoder = Decoder::new(bits, count, bytes)?;
+        (0..count).map(|_| decoder.next_brick()).collect()
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(60))]
+
+        #[test]
+        fn codes_come_back(
+            bits in 1_u8..=8, count in 0_usize..6, seed in any::<u32>(), noise in prop::sample::select(vec![0, 2, 5, 300]),
+        ) {
+            let bricks = bricks(bits, count, seed, noise);
+            let bytes = encode(bits, &bricks);
+            prop_assert_eq!(decode(bits, count, &bytes), Some(bricks));
+            prop_assert_eq!(decode(bits, count + 2, &bytes), None);
+        }
+
+        #[test]
+        fn damage_is_no_panic(
+            bits in 1_u8..=8, seed in any::<u32>(), at in any::<prop::sample::Index>(), flip in 1_u8..=255,
+            cut in any::<prop::sample::Index>(),
+        ) {
+            let mut bytes = encode(bits, &bricks(bits, 3, seed, 3));
+            let cut = cut.index(bytes.len());
+            prop_assert_eq!(decode(bits, 3, &bytes[..cut]), None);
+            let at = at.index(bytes.len());
+            bytes[at] ^= flip;
+            let _ = decode(bits, 3, &bytes);
+        }
+
+        #[test]
+        fn frequencies_add_up(counts in proptest::collection::vec(prop_oneof![Just(0_u32), 1..5_u32, 1..1_000_000_u32], 32)) {
+            let table = frequencies(&counts);
+            let expected = if counts.iter().any(|count| *count > 0) { SCALE } else { 0 };
+            prop_assert_eq!(table.iter().sum::<u32>(), expected);
+            prop_assert!(table.iter().zip(&counts).all(|(f, count)| (*f > 0) == (*count > 0)));
+            let mut bytes = Vec::new();
+            write_table(&table, &mut bytes);
+            prop_assert_eq!(read_table(32, &mut &bytes[..]), Some(table));
+        }
+    }
+
+    #[test]
+    fn what_neighbours_tell_is_not_paid_for() {
+        let ramp: Codes = std::array::from_fn(|i| (((i >> 6) + (i >> 3 & 7) + (i & 7)) * 15 / 21) as u8);
+        let smooth = encode(4, &[ramp; 40]);
+        assert!(smooth.len() < 40 * 256 / 4, "{}", smooth.len());
+    }
+}
