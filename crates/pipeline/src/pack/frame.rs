@@ -153,13 +153,13 @@ fn encode_channel(
     // A codec that is asked for is not weighed against others; what it cannot hold is kept as it is.
     let forced = options.codec.map(|codec| [codec, Codec::Uniform { bits: 8 }, Codec::F32]);
     let codecs: &[Codec] = forced.as_ref().map_or(&CODECS, |forced| forced);
-    let (encoded, error) = encode_level(&level, codecs, &scale, &target(&level, voxels));
+    let (encoded, error) = encode_level(&level, codecs, forced.is_some(), &scale, &target(&level, voxels));
     let mut levels = vec![encoded];
     for _ in 0..options.coarser_levels {
         let Some(coarser) = level.coarser(tree.background) else { break };
         level = coarser;
         let voxels = level.voxels(tree.background);
-        levels.push(encode_level(&level, codecs, &scale, &target(&level, voxels)).0);
+        levels.push(encode_level(&level, codecs, forced.is_some(), &scale, &target(&level, voxels)).0);
     }
     let world_from_index =
         linear_transform(&grid.name, &grid.transform).ok().map(|affine| affine.to_cols_array());
@@ -209,15 +209,22 @@ fn source_header(grid: &Grid, metadata: &Metadata) -> Result<Vec<u8>, EncodeErro
     Ok(bytes)
 }
 
-/// Encodes the bricks of a level. Gives the sum of their squared errors and the largest error as well.
+/// Encodes the bricks of a level, each in the codec that meets the target best, or if forced in the first that can
+/// hold it. Gives the sum of their squared errors and the largest error as well.
 fn encode_level(
     level: &Level,
     codecs: &[Codec],
+    is_forced: bool,
     scale: &ChannelScale,
     target: &Target,
 ) -> (EncodedLevel, (f64, f32)) {
     let errors = map(&level.bricks, |brick| measure(brick, codecs, scale));
-    let chosen = choose(codecs, &errors, target);
+    let chosen: Vec<usize> = match is_forced {
+        true => {
+            errors.iter().map(|of| of.iter().position(Option::is_some).unwrap_or(codecs.len() - 1)).collect()
+        }
+        false => choose(codecs, &errors, target),
+    };
     let items: Vec<_> = level.bricks.iter().zip(&chosen).collect();
     let written = map(&items, |(brick, i)| {
         let mut words = Vec::with_capacity(codecs[**i].word_count());
