@@ -37,13 +37,27 @@ pub(crate) fn find(input: &Path, range: Option<&FrameRange>) -> Result<Vec<Frame
                 frame: Some(number),
                 path: PathBuf::from(format!("{}#{number}", path.display())),
             };
-            Ok(wanted.map(frame).collect())
+            let found: Vec<FrameFile> = wanted.map(frame).collect();
+            match found.is_empty() {
+                true => Err(Failure::file(input, none_wanted(&asset))),
+                false => Ok(found),
+            }
         }
-        Some(_) => Ok(vec![FrameFile { frame: None, path: input.to_owned() }]),
+        Some((_, number)) => Ok(vec![FrameFile { frame: number, path: input.to_owned() }]),
         None => {
             let found = find_frames(&input.to_string_lossy(), range);
             Ok(found.map_err(|error| Failure::file(input, error.to_string()))?.frames)
         }
+    }
+}
+
+/// Why no frame is left.
+fn none_wanted(asset: &Asset) -> String {
+    match asset.contents().frames.len().checked_sub(1) {
+        Some(last) => {
+            format!("no frame is in that range; there are {} to {}", number(asset, 0), number(asset, last))
+        }
+        None => "there is no frame in this file".to_owned(),
     }
 }
 
@@ -59,6 +73,17 @@ pub(crate) fn number(asset: &Asset, frame: usize) -> i64 {
 /// If it is damaged or not packed.
 pub(crate) fn open(path: &Path) -> Result<Asset, Failure> {
     Asset::open(DiskFile::open_plain(path)?).map_err(|error| Failure::file(path, error.to_string()))
+}
+
+/// Reads all bricks of a packed file, to see whether they are sound.
+///
+/// # Errors
+/// If the file is damaged.
+pub(crate) fn check(path: &Path) -> Result<(), Failure> {
+    let asset = open(path)?;
+    let mut pages = 0..asset.store().pages().len();
+    let checked = pages.try_for_each(|page| asset.read_page(page).map(drop));
+    checked.map_err(|error| Failure::file(path, error.to_string()))
 }
 
 /// The bytes of a .vdb file that holds what a frame of a packed file holds.

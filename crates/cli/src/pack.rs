@@ -2,6 +2,7 @@
 //!
 //! The options and the closing report live here; packing itself is the pipeline's.
 
+use std::collections::HashSet;
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
 use std::time::Instant;
@@ -111,6 +112,15 @@ pub(crate) fn run(
         FrameName { number: frame.frame, name: name.to_string_lossy().into_owned() }
     };
     let names: Vec<FrameName> = frames.iter().map(name).collect();
+    let mut numbers = HashSet::new();
+    // A frame is asked for by its number, or by its place if it has none.
+    let number = |(place, name): (usize, &FrameName)| name.number.unwrap_or(place as i64 + 1);
+    if let Some(twice) = names.iter().enumerate().map(number).find(|number| !numbers.insert(*number)) {
+        return Err(Failure::Usage(format!(
+            "two frames would have the number {twice}; a .nuage file takes one sequence: put grids of several \
+             files together in .vdb files first"
+        )));
+    }
     let bar = progress::bar(1);
     bar.set_message(one_line(&output.display().to_string()));
     let load = |frame: usize| convert::load(args, &frames[frame].path);

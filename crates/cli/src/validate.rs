@@ -9,6 +9,7 @@ use nuage_vdb::validate::{Report, Severity, validate};
 use serde_json::{Value, json};
 
 use crate::error::Failure;
+use crate::frames;
 use crate::json::text;
 use crate::source::{DiskFile, Memory};
 use crate::text::{one_line, thousands};
@@ -61,6 +62,10 @@ fn look_at(path: &Path, memory: Memory) -> Result<Report, String> {
         Failure::File { what, .. } => what,
         other => other.to_string(),
     };
+    if let Some((file, None)) = frames::packed(path) {
+        // The frames behind the first one as well.
+        frames::check(&file).map_err(words)?;
+    }
     let disk = DiskFile::open(path).map_err(words)?;
     validate(&disk, memory.limits).map_err(|error| error.to_string())
 }

@@ -397,8 +397,8 @@ impl Gradient {
                 corners = fit_corners(&target);
             }
         }
-        // Below the unit there is nothing to fit, and a half float ends.
-        let corners = corners.map(|corner| corner.clamp(-4.0 * scale.unit, 4.0 * scale.unit));
+        // Bounds of entries end at twice the unit.
+        let corners = corners.map(|corner| corner.clamp(-1.9 * scale.unit, 1.9 * scale.unit));
         let (min, max) = bounds(corners.into_iter());
         let line = StoredLine::covering(min, max, 255, scale.unit);
         let inverse = inverse(line.line);

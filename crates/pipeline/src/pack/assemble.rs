@@ -166,10 +166,14 @@ impl<'c, W: Write + Seek> Assembler<'c, W> {
             };
             places.push((*codec, offset));
         }
-        let mut exact = HashMap::new();
+        let mut exact: HashMap<u32, f32> = HashMap::new();
         for (place, size, value) in &level.tiles {
-            builder.tile(*place, *size, value - background)?;
-            exact.insert((value - background).to_bits(), *value);
+            let mut relative = value - background;
+            // Beside a large background, small values differ by less than the difference can say.
+            while *exact.entry(relative.to_bits()).or_insert(*value) != *value {
+                relative = relative.next_up();
+            }
+            builder.tile(*place, *size, relative)?;
         }
         let tree = builder.topology()?;
         let constant = |value: f32| exact.get(&value.to_bits()).copied().unwrap_or(value + background);

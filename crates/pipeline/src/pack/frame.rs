@@ -211,6 +211,8 @@ fn source_header(grid: &Grid, metadata: &Metadata) -> Result<Vec<u8>, EncodeErro
 /// What decides which codec a brick gets.
 struct Choice {
     codecs: Vec<Codec>,
+    /// Whether it is the first of these that can hold the brick, whatever it costs.
+    is_forced: bool,
     max_error: Option<f32>,
     lambda: Lambda,
 }
@@ -221,10 +223,11 @@ impl Choice {
             // A codec that is asked for is not weighed against others; what it cannot hold takes more.
             Some(codec) => {
                 let codecs = vec![codec, Codec::Uniform { bits: 8 }, Codec::F32];
-                Choice { codecs, max_error: None, lambda: Lambda::NONE }
+                Choice { codecs, is_forced: true, max_error: None, lambda: Lambda::NONE }
             }
             None => Choice {
                 codecs: CODECS.to_vec(),
+                is_forced: false,
                 max_error: options.max_error.map(|bound| bound.of(planned.peak())),
                 lambda: planned.lambda,
             },
@@ -299,10 +302,13 @@ pub fn frame_totals(grids: &[Grid], plan: &Plan, options: &Options) -> Vec<Chann
 
 /// Encodes the bricks of a level. Gives the sum of their squared errors and the largest error as well.
 fn encode_level(level: &Level, scale: &ChannelScale, choice: &Choice) -> (EncodedLevel, (f64, f32)) {
-    let Choice { codecs, max_error, lambda } = choice;
+    let Choice { codecs, is_forced, max_error, lambda } = choice;
     let coded = map(&level.bricks, |brick| {
         let errors = measure(brick, codecs, scale);
-        let i = choose(codecs, &errors, *max_error, *lambda);
+        let i = match is_forced {
+            true => errors.iter().position(Option::is_some).unwrap_or(codecs.len() - 1),
+            false => choose(codecs, &errors, *max_error, *lambda),
+        };
         let mut words = Vec::with_capacity(codecs[i].word_count());
         write(brick, codecs[i], scale, &mut words);
         (codecs[i], errors[i], words)

@@ -70,24 +70,43 @@ fn read_header(grid: &FrameGrid, name: &str) -> Result<(Grid, Metadata), UnpackE
         return Ok((Grid::new(name, transform, tree), Metadata::default()));
     }
     let file = nuage_vdb::File::open(grid.source_header.as_slice())?;
-    Ok((file.read_grid(0)?, file.metadata.clone()))
+    let mut grid = file.read_grid(0)?;
+    // What its writer noted is true of a grid without voxels.
+    for noted in ["file_bbox_min", "file_bbox_max", "file_voxel_count", "file_mem_bytes", "file_compression"]
+    {
+        grid.metadata.remove(noted);
+    }
+    Ok((grid, file.metadata.clone()))
 }
 
 /// A grid like the one given, with these numbers.
 fn with_values(grid: Grid, trees: Vec<Tree<f32>>) -> Result<Grid, UnpackError> {
     let tree: AnyTree = match (&*grid.tree, <[Tree<f32>; 3]>::try_from(trees)) {
-        (AnyTree::Vec3d(_), Ok(trees)) => zip(&trees)?.map(|value| value.map(f64::from)).into(),
+        (AnyTree::Vec3d(like), Ok(trees)) => {
+            let (tree, exact) = (zip(&trees)?, like.background);
+            let narrow = tree.background;
+            let wide = |value: [f32; 3]| std::array::from_fn(|c| widened(value[c], narrow[c], exact[c]));
+            tree.map(wide).into()
+        }
         (_, Ok(trees)) => zip(&trees)?.into(),
         (like, Err(trees)) => {
             let tree = trees.into_iter().next().unwrap_or_else(|| Tree::empty(0.0, Shape::STANDARD));
             match like {
-                AnyTree::Double(_) => tree.map(f64::from).into(),
+                AnyTree::Double(like) => {
+                    let narrow = tree.background;
+                    tree.map(|value| widened(value, narrow, like.background)).into()
+                }
                 AnyTree::Half(_) => tree.map(half::f16::from_f32).into(),
                 _ => tree.into(),
             }
         }
     };
     Ok(Grid { tree: Arc::new(tree), ..grid })
+}
+
+/// A number of a grid of doubles. The background is the source's to the last bit, if it is what was rounded.
+fn widened(value: f32, background: f32, exact: f64) -> f64 {
+    if value == background && exact as f32 == background { exact } else { f64::from(value) }
 }
 
 /// A tree of vectors from those of their numbers: leaves and tiles wherever one of them has some.

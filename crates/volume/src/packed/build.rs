@@ -54,9 +54,14 @@ impl Packer {
         let EntryScale { unit, background } = scale;
         let bounds = |footprint: Bounds| match background {
             0.0 => footprint,
-            // The sum may be rounded inward.
+            // The sum may be rounded inward, and so may the difference have been.
             shift => {
-                Bounds { min: (footprint.min + shift).next_down(), max: (footprint.max + shift).next_up() }
+                let [min, max] = [footprint.min, footprint.max];
+                let slack = |value: f32| f32::EPSILON * value.abs();
+                Bounds {
+                    min: (min - slack(min) + shift).next_down(),
+                    max: (max + slack(max) + shift).next_up(),
+                }
             }
         };
         let pack = |entry: &tree::Entry, footprint: Bounds, child: &dyn Fn(u32) -> Content| {

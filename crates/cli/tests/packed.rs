@@ -1,0 +1,289 @@
+//! Packed files as a user has them: `convert` there and back, and every subcommand that looks into one.
+
+use std::ffi::OsStr;
+use std::fs;
+use std::path::PathBuf;
+use std::process::{Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+use nuage_testkit as testkit;
+use serde_json::Value;
+use tempfile::TempDir;
+
+fn command<I: AsRef<OsStr>>(args: impl IntoIterator<Item = I>) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_nuage"));
+    command.args(args).stdin(Stdio::null());
+    command
+}
+
+fn nuage<I: AsRef<OsStr>>(args: impl IntoIterator<Item = I>) -> Output {
+    command(args).output().unwrap()
+}
+
+fn stdout(output: &Output) -> &str {
+    std::str::from_utf8(&output.stdout).unwrap()
+}
+
+fn stderr(output: &Output) -> &str {
+    std::str::from_utf8(&output.stderr).unwrap()
+}
+
+fn succeeds<I: AsRef<OsStr>>(args: impl IntoIterator<Item = I>) -> String {
+    let output = nuage(args);
+    assert!(output.status.success(), "{}{}", stdout(&output), stderr(&output));
+    stdout(&output).to_owned()
+}
+
+/// That it fails with this code and says this.
+fn fails<I: AsRef<OsStr>>(args: impl IntoIterator<Item = I>, code: i32, says: &str) {
+    let output = nuage(args);
+    let said = format!("{}{}", stdout(&output), stderr(&output));
+    assert!(output.status.code() == Some(code) && said.contains(says), "{:?}: {said}", output.status);
+}
+
+/// The first frames of the committed sequence.
+const FRAMES: [i64; 3] = [2, 3, 4];
+
+fn blast(frame: &str) -> PathBuf {
+    testkit::workspace().join(format!("assets/blast/blast.{frame}.vdb"))
+}
+
+/// A folder, and in it the frames as `blast.nuage`.
+struct Folder(TempDir);
+
+impl Folder {
+    fn at(&self, name: &str) -> String {
+        self.0.path().join(name).to_str().unwrap().to_owned()
+    }
+
+    fn names(&self) -> Vec<String> {
+        let entries = fs::read_dir(self.0.path()).unwrap();
+        let mut names: Vec<String> =
+            entries.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
+        names.sort();
+        names
+    }
+}
+
+fn folder() -> Folder {
+    let folder = Folder(tempfile::tempdir().unwrap());
+    let input = blast("####");
+    let said = succeeds([
+        "convert",
+        "--frames=2-4",
+        "--fps=24",
+        "--max-error=0.5%",
+        input.to_str().unwrap(),
+        &folder.at("blast.nuage"),
+    ]);
+    assert!(said.contains("3 frames") && said.contains("dB"), "{said}");
+    assert_eq!(folder.names(), ["blast.nuage"]);
+    folder
+}
+
+/// Per grid: the largest difference of a voxel, and the largest value.
+fn differences(a: &str, b: &str) -> Vec<f64> {
+    let output = nuage(["diff", "--json", "--values-only", a, b]);
+    assert!(matches!(output.status.code(), Some(0 | 1)), "{}", stderr(&output));
+    let object: Value = serde_json::from_str(stdout(&output)).unwrap();
+    let grids = object["grids"].as_array().unwrap();
+    grids.iter().map(|grid| grid["voxels"]["max_difference"].as_f64().unwrap_or(0.0)).collect()
+}
+
+fn info(path: &str) -> Value {
+    serde_json::from_str(&succeeds(["info", "--json", path])).unwrap()
+}
+
+#[test]
+fn a_sequence_comes_back_frame_by_frame() {
+    let folder = folder();
+    let (nuage_file, out) = (folder.at("blast.nuage"), folder.at("back.####.vdb"));
+    succeeds(["convert", &nuage_file, &out]);
+    assert_eq!(folder.names(), ["back.0002.vdb", "back.0003.vdb", "back.0004.vdb", "blast.nuage"]);
+    for number in FRAMES {
+        let back = folder.at(&format!("back.{number:04}.vdb"));
+        let original = blast(&format!("{number:04}"));
+        let original = original.to_str().unwrap();
+        let (before, after) = (info(original), info(&back));
+        let grids = [&before, &after].map(|object| object["grids"].as_array().unwrap().clone());
+        assert_eq!(grids[0].len(), grids[1].len());
+        for key in ["name", "type", "class", "transform", "background", "half"] {
+            for (before, after) in grids[0].iter().zip(&grids[1]) {
+                assert_eq!(before[key], after[key], "{key}");
+            }
+        }
+        for difference in differences(original, &back) {
+            assert!(difference < 0.5, "{difference}");
+        }
+        // The frame where it is, and the file that came of it.
+        let inside = format!("{nuage_file}#{number}");
+        let said = succeeds(["diff", &inside, &back]);
+        assert!(said.ends_with("equal\n"), "{said}");
+        let one = folder.at(&format!("one.{number}.vdb"));
+        succeeds(["convert", &inside, &one]);
+        assert!(nuage(["diff", &one, &back]).status.success());
+    }
+    // The number stays with the frame.
+    succeeds(["convert", &format!("{nuage_file}#3"), &folder.at("some.####.vdb")]);
+    succeeds(["convert", &format!("{nuage_file}#3"), &folder.at("some.nuage")]);
+    succeeds(["info", &format!("{}#3", folder.at("some.nuage"))]);
+    succeeds(["convert", "--frames=4", &nuage_file, &folder.at("some.####.vdb")]);
+    let names = folder.names();
+    let some: Vec<&String> = names.iter().filter(|name| name.starts_with("some")).collect();
+    assert_eq!(some, ["some.0003.vdb", "some.0004.vdb", "some.nuage"]);
+    fails(["convert", "--force", &nuage_file, &folder.at("all.vdb")], 1, "all.####.vdb");
+    fails(["convert", "--frames=9", &nuage_file, &folder.at("no.####.vdb")], 1, "there are 2 to 4");
+    fails(["convert", &format!("{nuage_file}#9"), &folder.at("no.vdb")], 1, "there is no frame 9");
+}
+
+#[test]
+fn every_subcommand_reads_frames() {
+    let folder = folder();
+    let path = folder.at("blast.nuage");
+    let frame = format!("{path}#4");
+    let said = succeeds(["info", &path]);
+    assert!(said.contains("3 (2 to 4, 24 per second)") && said.contains("largest error"), "{said}");
+    assert!(succeeds(["info", &frame]).contains("density"));
+    for path in [&path, &frame] {
+        assert!(succeeds(["validate", path]).contains("valid"));
+        assert!(succeeds(["diff", path, path]).ends_with("equal\n"));
+    }
+    // The first frame is the one that is meant without a number.
+    assert!(nuage(["diff", &path, &format!("{path}#2")]).status.success());
+    assert!(!nuage(["diff", &path, &frame]).status.success());
+    let name = info(&frame)["grids"][0]["name"].as_str().unwrap().to_owned();
+    let probe = |path: &str| {
+        let grid = format!("--grid={name}");
+        let said = succeeds(["probe", &grid, path, "--", "3", "4", "5"]);
+        said.split_whitespace().nth(3).unwrap().parse::<f64>().unwrap()
+    };
+    let original = blast("0004");
+    assert!((probe(&frame) - probe(original.to_str().unwrap())).abs() < 0.5);
+    let picture = |input: &str, name: &str| {
+        let output = folder.at(name);
+        let options = "--up z --size 24 --samples 1 --step 4 --shadow-step 8 --sun-rays 1 --sky-rays 1";
+        succeeds(["render", input, "--output", &output].into_iter().chain(options.split_whitespace()));
+    };
+    picture(&frame, "one.png");
+    picture(&path, "all.####.png");
+    let pictures = folder.names().into_iter().filter(|name| name.ends_with("png")).collect::<Vec<_>>();
+    assert_eq!(pictures, ["all.0002.png", "all.0003.png", "all.0004.png", "one.png"]);
+    // As the file that the frame is.
+    let unpacked = folder.at("four.vdb");
+    succeeds(["convert", &frame, &unpacked]);
+    picture(&unpacked, "same.png");
+    assert!(fs::read(folder.at("one.png")).unwrap() == fs::read(folder.at("same.png")).unwrap());
+}
+
+#[test]
+fn what_makes_no_sense_is_said() {
+    let folder = folder();
+    let (input, output) = (blast("0001"), folder.at("out.nuage"));
+    let input = input.to_str().unwrap();
+    for (options, says) in [
+        (&["--psnr=0"][..], "--psnr must be"),
+        (&["--psnr=nan"], "--psnr must be"),
+        (&["--bits-per-voxel=-1"], "--bits-per-voxel"),
+        (&["--max-error=-1"], "0 or above"),
+        (&["--max-error=big"], "write a number"),
+        (&["--levels=40"], "--levels"),
+        (&["--codec=zip"], "codecs of .nvdb"),
+        (&["--codec=u9"], "u1 to u8"),
+        (&["--half"], "--half is for"),
+        (&["--compression=zip"], "--compression is for"),
+        (&["--encoding=fp8"], "--encoding is for"),
+        (&["--split"], "--split is for"),
+        (&["--fps=inf"], "--fps must be"),
+    ] {
+        fails(["convert"].iter().chain(options).chain(&[input, &output]), 2, says);
+    }
+    let (vdb, nvdb) = (folder.at("out.vdb"), folder.at("out.nvdb"));
+    fails(["convert", "--psnr=40", input, &vdb], 2, "--psnr is for");
+    fails(["convert", "--codec=f16", input, &vdb], 2, "--codec is for");
+    fails(["convert", "--codec=f16", input, &nvdb], 2, "none, zip and blosc");
+    fails(["convert", "--levels=2", input, &nvdb], 2, "--levels is for");
+    fails(["convert", input, input, &output], 2, "two frames would have the number");
+    assert_eq!(folder.names(), ["blast.nuage"]);
+}
+
+#[test]
+fn nothing_is_replaced_unasked() {
+    let folder = folder();
+    let (input, output) = (blast("0001"), folder.at("blast.nuage"));
+    let before = fs::read(&output).unwrap();
+    fails(["convert", input.to_str().unwrap(), &output], 1, "--force");
+    assert_eq!(fs::read(&output).unwrap(), before);
+    succeeds(["convert", "--force", input.to_str().unwrap(), &output]);
+    assert_ne!(fs::read(&output).unwrap(), before);
+    assert_eq!(folder.names(), ["blast.nuage"]);
+}
+
+#[test]
+fn damage_is_noticed_wherever_it_is() {
+    let folder = folder();
+    let sound = fs::read(folder.at("blast.nuage")).unwrap();
+    let bad = folder.at("bad.nuage");
+    let damaged = |at: usize| {
+        let mut bytes = sound.clone();
+        bytes[at] ^= 1;
+        bytes
+    };
+    let places = [8, 20, 100, sound.len() / 3, sound.len() / 2, sound.len() - 500, sound.len() - 3];
+    for (what, bytes) in places
+        .into_iter()
+        .map(|at| (at, damaged(at)))
+        .chain([0, 63, sound.len() / 2, sound.len() - 1].map(|len| (len, sound[..len].to_vec())))
+    {
+        fs::write(&bad, bytes).unwrap();
+        for args in [&["validate", &bad][..], &["convert", &bad, &folder.at("no.####.vdb")]] {
+            let output = nuage(args);
+            let said = format!("{}{}", stdout(&output), stderr(&output));
+            let is_error = output.status.code() == Some(1) && said.contains("bad.nuage");
+            assert!(
+                is_error && said.lines().count() <= FRAMES.len() && !said.contains("panicked"),
+                "{what}: {said}"
+            );
+        }
+        for number in FRAMES {
+            let _ = fs::remove_file(folder.at(&format!("no.{number:04}.vdb")));
+        }
+    }
+    for command in ["info", "validate"] {
+        fs::write(&bad, &sound[..sound.len() / 2]).unwrap();
+        fails([command, &bad], 1, "bad.nuage");
+        fails([command, &format!("{bad}#3")], 1, "bad.nuage");
+        fails([command, &folder.at("nowhere.nuage")], 1, "nowhere.nuage");
+    }
+    // A file of another kind under the name.
+    fs::copy(blast("0001"), &bad).unwrap();
+    fails(["info", &bad], 1, "bad.nuage");
+}
+
+#[cfg(unix)]
+#[test]
+fn a_conversion_that_is_killed_leaves_nothing_or_all() {
+    let folder = Folder(tempfile::tempdir().unwrap());
+    let (input, output) = (blast("####"), folder.at("out.nuage"));
+    let args = ["convert", "--frames=1-3", "--force", input.to_str().unwrap(), &output];
+    let start = Instant::now();
+    succeeds(args);
+    let (whole, took) = (fs::read(&output).unwrap(), start.elapsed());
+    for part in 0..8 {
+        // Half of the times something stands there before.
+        let before = if part % 2 == 0 { Some(b"precious".to_vec()) } else { None };
+        let _ = fs::remove_file(&output);
+        if let Some(before) = &before {
+            fs::write(&output, before).unwrap();
+        }
+        let mut child = command(args).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+        std::thread::sleep(took.mul_f64(0.1 + 0.125 * f64::from(part)).min(Duration::from_secs(2)));
+        child.kill().unwrap();
+        child.wait().unwrap();
+        let after = fs::read(&output).ok();
+        assert!(
+            after == before || after.as_ref() == Some(&whole),
+            "{:?} bytes",
+            after.map(|bytes| bytes.len())
+        );
+    }
+}
