@@ -733,7 +733,7 @@ mod tests {
         ] {
             let sequence = find(&folder, input, "").unwrap();
             assert_eq!(numbers(&sequence), [-1, 2, 10], "{input}");
-            assert_eq!(sequence.missing, []);
+            assert!(sequence.missing.is_empty());
             assert!(sequence.frames[1].path.ends_with("smoke.0002.vdb"));
         }
     }

@@ -13,5 +13,38 @@ pub mod ktx2;
 pub mod layout;
 pub mod sidecar;
 
+use build::BrickTexture;
+
+/// The kinds of texture file.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Container {
+    /// A .dds file.
+    Dds,
+    /// A .ktx2 file.
+    Ktx2,
+}
+
+impl Container {
+    /// The kind of file that an extension stands for, whatever its case.
+    pub fn of_extension(extension: &str) -> Option<Container> {
+        match extension.to_ascii_lowercase().as_str() {
+            "dds" => Some(Container::Dds),
+            "ktx2" => Some(Container::Ktx2),
+            _ => None,
+        }
+    }
+
+    /// The file of a texture: a header and the texels.
+    pub fn file(self, texture: BrickTexture) -> Vec<u8> {
+        let header = match self {
+            Container::Dds => dds::header(&texture.layout),
+            Container::Ktx2 => ktx2::header(&texture.layout),
+        };
+        let mut bytes = texture.bytes;
+        bytes.splice(0..0, header);
+        bytes
+    }
+}
+
 #[cfg(test)]
 mod tests;
