@@ -312,7 +312,7 @@ impl Encoder<'_> {
             Some(scale) if self.format != TextureFormat::R16F => {
                 Ok((scale, self.normalised(&decode()?, scale)))
             }
-            _ if codec == wanted => self.from_words(self.stored(codec, offset)?),
+            _ if codec == wanted => self.of_words(self.stored(codec, offset)?),
             _ => {
                 let scale = ChannelScale {
                     unit: self.channel.unit,
@@ -323,7 +323,7 @@ impl Encoder<'_> {
                 };
                 let mut words = Vec::with_capacity(wanted.word_count());
                 quantize::write(&decode()?, wanted, &scale, &mut words);
-                self.from_words(&words)
+                self.of_words(&words)
             }
         }
     }
@@ -339,7 +339,7 @@ impl Encoder<'_> {
     }
 
     /// Scale and bytes of a brick in the codec of the format.
-    fn from_words(&self, words: &[u32]) -> Result<(BrickScale, Vec<u8>), TextureError> {
+    fn of_words(&self, words: &[u32]) -> Result<(BrickScale, Vec<u8>), TextureError> {
         let unit = self.channel.unit;
         if self.format == TextureFormat::R16F {
             // Two halves a word: each is looked at for being finite.

@@ -164,7 +164,9 @@ proptest! {
                     }
                 }
             }
-            prop_assert!(copied > 0 || is_common || !is_stored_so, "{:?}: none was copied", format);
+            // The packer takes blocks only where empty voxels stay empty, and halves where 8 bits do not do.
+            let is_sure = is_stored_so && has_negative != (format == TextureFormat::R16F);
+            prop_assert!(copied > 0 || is_common || !is_sure, "{:?}: none was copied", format);
         }
     }
 
