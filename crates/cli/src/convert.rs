@@ -366,7 +366,7 @@ fn target(args: &Args, output: &Path) -> Result<Target, Failure> {
 }
 
 /// Refuses a file that is there before the work is done. What holds against a race is in the writing itself.
-fn check_absent(path: &Path, force: bool) -> Result<(), Failure> {
+pub(crate) fn check_absent(path: &Path, force: bool) -> Result<(), Failure> {
     match !force && path.symlink_metadata().is_ok() {
         true => Err(Failure::file(path, "the file exists already; --force replaces it")),
         false => Ok(()),

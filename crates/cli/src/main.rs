@@ -21,6 +21,7 @@ mod sample;
 mod shot;
 mod source;
 mod text;
+mod texture;
 mod validate;
 mod values;
 
@@ -50,6 +51,7 @@ enum Command {
     Diff(diff::Args),
     Validate(validate::Args),
     Convert(convert::Args),
+    Texture(texture::Args),
 }
 
 fn main() -> ExitCode {
@@ -61,6 +63,7 @@ fn main() -> ExitCode {
         Command::Diff(args) => diff::run(&args),
         Command::Validate(args) => validate::run(&args),
         Command::Convert(args) => convert::run(&args),
+        Command::Texture(args) => texture::run(&args),
     };
     match outcome {
         Ok(()) => ExitCode::SUCCESS,

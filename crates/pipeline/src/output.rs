@@ -96,6 +96,29 @@ pub fn write_whole_with<T, E: From<OutputError>>(
     }
 }
 
+/// Writes two files that belong together: both appear, or none does. Only with `overwrite`, and only if the system fails
+/// between two renames, may the first be left without the second.
+///
+/// # Errors
+/// [`OutputError`], as for [`write_whole`].
+pub fn write_both(files: [(&Path, &[u8]); 2], overwrite: bool) -> Result<(), OutputError> {
+    let [(first, first_bytes), (second, second_bytes)] = files;
+    let mut has_first = false;
+    // The first appears while the second lies complete under a temporary name.
+    let written = write_whole_with(second, overwrite, |file| {
+        let error = |source| OutputError::Io { path: second.to_owned(), source };
+        file.write_all(second_bytes).and_then(|()| file.sync_all()).map_err(error)?;
+        write_whole(first, first_bytes, overwrite)?;
+        has_first = true;
+        Ok(())
+    });
+    if written.is_err() && has_first && !overwrite {
+        // It was not there before, so it is ours. That it stays behind is all that can go wrong.
+        let _ = fs::remove_file(first);
+    }
+    written
+}
+
 /// A temporary file that is removed when dropped.
 fn temporary_in(folder: &Path) -> io::Result<NamedTempFile> {
     let mut builder = tempfile::Builder::new();
@@ -145,6 +168,24 @@ mod tests {
         write_whole(&path, b"second", true).unwrap();
         assert_eq!(fs::read(&path).unwrap(), b"second");
         assert_eq!(names_in(folder.path()), ["a.bin"]);
+    }
+
+    #[test]
+    fn of_two_files_none_appears_without_the_other() {
+        let folder = tempfile::tempdir().unwrap();
+        let [a, b] = ["a.bin", "b.bin"].map(|name| folder.path().join(name));
+        for taken in [&a, &b] {
+            fs::write(taken, b"before").unwrap();
+            let error = write_both([(&a, b"a"), (&b, b"b")], false).unwrap_err();
+            assert!(matches!(error, OutputError::Exists { path } if path == *taken));
+            assert_eq!(names_in(folder.path()).len(), 1);
+            assert_eq!(fs::read(taken).unwrap(), b"before");
+            fs::remove_file(taken).unwrap();
+        }
+        write_both([(&a, b"a"), (&b, b"b")], false).unwrap();
+        write_both([(&a, b"aa"), (&b, b"bb")], true).unwrap();
+        assert_eq!([fs::read(&a).unwrap(), fs::read(&b).unwrap()], [b"aa", b"bb"]);
+        assert_eq!(names_in(folder.path()), ["a.bin", "b.bin"]);
     }
 
     #[test]

@@ -336,7 +336,7 @@ fn encode_level(level: &Level, scale: &ChannelScale, choice: &Choice) -> (Encode
 }
 
 /// The results for all items, in order, on all threads where the feature `parallel` says so.
-pub(super) fn map<T: Sync, R: Send>(items: &[T], run: impl Fn(&T) -> R + Sync + Send) -> Vec<R> {
+pub(crate) fn map<T: Sync, R: Send>(items: &[T], run: impl Fn(&T) -> R + Sync + Send) -> Vec<R> {
     #[cfg(feature = "parallel")]
     {
         use rayon::prelude::*;

@@ -11,7 +11,7 @@ use crate::encode::quantize::ChannelScale;
 pub const LARGEST: f32 = 8.507_059e37; // 2¹²⁶
 
 /// The part of the peak by which empty voxels may be off.
-const BACKGROUND_TOLERANCE: f32 = 1e-3;
+pub(crate) const BACKGROUND_TOLERANCE: f32 = 1e-3;
 
 /// Which channel a tree of numbers belongs to: frames are matched by it.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
