@@ -282,6 +282,12 @@ fn target(args: &Args, output: &Path) -> Result<Target, Failure> {
             Err(Failure::Usage(format!("{option} is for outputs with the extension {extension}")))
         })
     };
+    let of_vdb = [
+        ("--compression", args.compression.is_some()),
+        ("--no-active-mask", args.no_active_mask),
+        ("--half", args.half),
+        ("--full", args.full),
+    ];
     let absolute = |bound: Option<Bound>| match bound {
         None => Ok(0.0),
         Some(Bound::Absolute(error)) => Ok(error),
@@ -311,15 +317,7 @@ fn target(args: &Args, output: &Path) -> Result<Target, Failure> {
             Ok(Target::Vdb(WriteOptions { compression }))
         }
         Some("nvdb") => {
-            misplaced(
-                &[
-                    ("--compression", args.compression.is_some()),
-                    ("--no-active-mask", args.no_active_mask),
-                    ("--half", args.half),
-                    ("--full", args.full),
-                ],
-                ".vdb",
-            )?;
+            misplaced(&of_vdb, ".vdb")?;
             let encoding = match args.encoding.unwrap_or(NanoEncoding::Full) {
                 NanoEncoding::Full => nano::Encoding::Full,
                 NanoEncoding::Fp16 => nano::Encoding::Fp16,
@@ -337,15 +335,7 @@ fn target(args: &Args, output: &Path) -> Result<Target, Failure> {
             Ok(Target::Nano(nano::WriteOptions { encoding, codec }))
         }
         Some("nuage") => {
-            misplaced(
-                &[
-                    ("--compression", args.compression.is_some()),
-                    ("--no-active-mask", args.no_active_mask),
-                    ("--half", args.half),
-                    ("--full", args.full),
-                ],
-                ".vdb",
-            )?;
+            misplaced(&of_vdb, ".vdb")?;
             misplaced(&[("--encoding", args.encoding.is_some())], ".nvdb")?;
             let codec = match args.codec {
                 None => None,

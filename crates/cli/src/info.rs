@@ -164,6 +164,8 @@ fn show_packed(path: &Path, out: &mut impl Write) -> Result<(), Failure> {
     let rate =
         contents.frame_rate.map_or(String::new(), |rate| format!(", {} per second", text::number(rate)));
     let memory = asset.memory_bytes();
+    // All bricks, though none is loaded yet.
+    let brick_words: u64 = asset.store().pages().iter().map(|page| u64::from(page.word_count)).sum();
     writeln!(
         out,
         "{}: packed, {} bytes",
@@ -175,7 +177,7 @@ fn show_packed(path: &Path, out: &mut impl Write) -> Result<(), Failure> {
         out,
         "  in memory   tree {}, bricks {}, shapes {} bytes",
         text::thousands(memory.trees as u64),
-        text::thousands(memory.bricks as u64),
+        text::thousands(4 * brick_words),
         text::thousands(memory.shapes as u64)
     )?;
     for channel in &contents.channels {

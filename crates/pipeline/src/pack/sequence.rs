@@ -116,12 +116,12 @@ pub fn pack<E: Send, W: Write + Seek>(
     Ok((assembler.finish()?, plan))
 }
 
-/// A zstd frame of some bytes.
+/// A zstd frame of some bytes, or nothing if it cannot be made.
 #[cfg(feature = "native-zstd")]
 pub fn compress(bytes: &[u8]) -> Vec<u8> {
     /// Higher levels take long and give little on codes.
     const LEVEL: i32 = 12;
-    // It fails for lack of memory only; what is empty is stored as it is.
+    // It fails for lack of memory only; the bytes are then stored as they are.
     zstd::bulk::compress(bytes, LEVEL).unwrap_or_default()
 }
 

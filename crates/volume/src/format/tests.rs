@@ -324,3 +324,14 @@ proptest! {
         }
     }
 }
+
+#[test]
+fn a_compressor_that_gives_nothing_costs_nothing_but_bytes() {
+    let (contents, trees, store) = parts(40);
+    let mut file = Cursor::new(Vec::new());
+    write(&mut file, &contents, &trees, &store, &|_| Vec::new()).unwrap();
+    let mut asset = Asset::open(file.into_inner()).unwrap();
+    asset.load_all().unwrap();
+    assert_eq!((asset.contents(), asset.trees()), (&contents, &trees));
+    assert_eq!(asset.store(), &store);
+}

@@ -15,7 +15,8 @@ use crate::codec::Codec;
 use crate::packed::Trees;
 use crate::packed::store::{BrickStore, PAGE_WORDS, StoreError};
 
-/// Makes one Zstandard frame of bytes. Its window must not exceed the larger of 8 MiB and the bytes given.
+/// Makes one Zstandard frame of bytes, or nothing if it cannot: they are then stored as they are. Its window must not
+/// exceed the larger of 8 MiB and the bytes given.
 pub type Compress<'a> = dyn Fn(&[u8]) -> Vec<u8> + 'a;
 
 /// Where the bytes of a file went.
@@ -92,7 +93,7 @@ impl<'a, W: Write + Seek> Writer<'a, W> {
 
     fn chunk(&mut self, kind: Kind, bytes: &[u8], bricks: [u32; 2]) -> Result<(), FormatError> {
         let compressed = (self.compress)(bytes);
-        let is_compressed = compressed.len() < bytes.len();
+        let is_compressed = !compressed.is_empty() && compressed.len() < bytes.len();
         let stored = if is_compressed { &compressed } else { bytes };
         let (stored_bytes, decoded_bytes) = (stored.len() as u64, bytes.len() as u64);
         let checksum = xxh3_64(stored);
