@@ -20,3 +20,16 @@ pub mod select;
 #[cfg(feature = "fs")]
 pub mod sequence;
 pub mod texture;
+
+/// The results for 0 up to `count`, in order, on all threads where the feature `parallel` says so.
+pub(crate) fn each<R: Send>(count: usize, run: impl Fn(usize) -> R + Sync + Send) -> Vec<R> {
+    #[cfg(feature = "parallel")]
+    {
+        use rayon::prelude::*;
+        (0..count).into_par_iter().map(run).collect()
+    }
+    #[cfg(not(feature = "parallel"))]
+    {
+        (0..count).map(run).collect()
+    }
+}

@@ -8,7 +8,7 @@
 
 use nuage_volume::codec::Codec;
 
-use super::quantize::Error;
+use super::quantize::{Error, Measure};
 
 /// What a channel's bricks have to keep to, together.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -22,127 +22,252 @@ pub struct Target {
 
 /// How λ is stepped: so many steps double it.
 const STEPS_PER_OCTAVE: i32 = 16;
-/// The first and last step. Beyond, for values of any unit, λ makes no difference.
+/// The first and last step. Beyond, λ makes no difference.
 const FIRST_STEP: i32 = -8 * STEPS_PER_OCTAVE;
 const LAST_STEP: i32 = 40 * STEPS_PER_OCTAVE;
 const STEPS: usize = (LAST_STEP - FIRST_STEP + 1) as usize;
 
-/// The weight of a squared error of 1 in units of a channel, in words.
-#[derive(Debug, Clone, Copy, PartialEq)]
+/// The weight of a squared error of 1, in units of a channel, in words.
+#[derive(Debug, Clone, Copy, PartialEq, PartialOrd)]
 pub struct Lambda(f64);
 
 impl Lambda {
     /// Words alone count.
     pub const NONE: Lambda = Lambda(0.0);
+    /// The largest of the ladder.
+    pub const LARGEST: Lambda = Lambda((1_u64 << (LAST_STEP / STEPS_PER_OCTAVE)) as f64);
 
-    /// The λ of a step, for errors of a channel of this unit.
-    fn of_step(step: i32, unit: f32) -> Lambda {
-        Lambda((f64::from(step) / f64::from(STEPS_PER_OCTAVE)).exp2() / f64::from(unit).powi(2))
+    fn of_step(step: usize) -> Lambda {
+        let octaves = (step as i32 + FIRST_STEP) as f64 / f64::from(STEPS_PER_OCTAVE);
+        Lambda(octaves.exp2())
+    }
+
+    /// A λ with which so many bricks are sure to keep to a sum of squared errors, in units of the channel: a brick is
+    /// worth all its 512 words where its error is more than its share. Some more, so that a step lies below it.
+    pub fn sure(bricks: u64, squared_error: f64) -> Lambda {
+        let exact = 2.0 * Codec::F32.word_count() as f64;
+        Lambda((exact * bricks as f64 / squared_error).min(Lambda::LARGEST.0))
     }
 }
 
-/// The codec of a brick, as an index into `codecs`, from the errors that [`super::quantize::measure`] gives. The last
-/// codec is that of bricks which none of the others can hold.
-pub fn choose(codecs: &[Codec], errors: &[Option<Error>], max_error: Option<f32>, lambda: Lambda) -> usize {
-    let mut best = (codecs.len() - 1, f64::INFINITY);
-    for (i, error) in errors.iter().enumerate() {
-        let Some(error) = error else { continue };
-        let cost = codecs[i].word_count() as f64 + lambda.0 * f64::from(error.squared);
-        if cost < best.1 && max_error.is_none_or(|bound| error.max <= bound) {
-            best = (i, cost);
+/// A codec that a brick may get.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Candidate {
+    /// The codec.
+    pub codec: Codec,
+    /// How far off the brick is in it.
+    pub error: Error,
+}
+
+impl Candidate {
+    fn words(&self) -> f64 {
+        self.codec.word_count() as f64
+    }
+
+    fn cost(&self, lambda: Lambda) -> f64 {
+        self.words() + lambda.0 * self.error.squared
+    }
+}
+
+/// The codecs that are the best for a brick with one λ or another, from the least to the largest. Each takes more words
+/// than the one before and has less error, and each saves less error per word.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Curve(Vec<Candidate>);
+
+impl Curve {
+    /// Tries codecs, which are sorted by their words, as far as they can be the best with some λ up to `largest`. The
+    /// last has to hold every brick.
+    pub fn of(measure: &mut Measure, codecs: &[Codec], max_error: Option<f32>, largest: Lambda) -> Curve {
+        let mut curve: Vec<Candidate> = Vec::new();
+        for codec in codecs {
+            // With a smaller λ, the best so far but gains on what takes more words.
+            let words = codec.word_count() as f64;
+            if curve.iter().any(|candidate| candidate.cost(largest) <= words) {
+                break;
+            }
+            let Some(error) = measure.error(*codec) else { continue };
+            if max_error.is_some_and(|bound| error.max > bound) {
+                continue;
+            }
+            let candidate = Candidate { codec: *codec, error };
+            if curve.last().is_some_and(|last| last.error.squared <= error.squared) {
+                continue;
+            }
+            // Drop what is never the best beside this one.
+            while let Some(last) = curve.last() {
+                let is_better = last.words() < candidate.words()
+                    && match curve.iter().rev().nth(1) {
+                        Some(before) => turn(before, last) < turn(last, &candidate),
+                        None => true,
+                    };
+                if is_better {
+                    break;
+                }
+                curve.pop();
+            }
+            curve.push(candidate);
         }
+        Curve(curve)
     }
-    best.0
+
+    /// The best with a λ.
+    ///
+    /// # Panics
+    /// If there is none: the last of the codecs cannot hold the brick.
+    pub fn at(&self, lambda: Lambda) -> Candidate {
+        let mut best = self.0[0];
+        for candidate in &self.0[1..] {
+            if candidate.cost(lambda) >= best.cost(lambda) {
+                break;
+            }
+            best = *candidate;
+        }
+        best
+    }
 }
 
-/// What each λ leads to: the sum of squared errors and of words over some bricks.
+/// The λ beyond which `fine` is better than `coarse`.
+fn turn(coarse: &Candidate, fine: &Candidate) -> f64 {
+    (fine.words() - coarse.words()) / (coarse.error.squared - fine.error.squared)
+}
+
+/// What each λ leads to: the sum of squared errors, in units of the channel, and of words over some bricks.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Totals {
-    steps: Vec<(f64, u64)>,
+    /// What bricks lose of their error and gain in words where a step is reached.
+    turns: Vec<(f64, u64)>,
+    /// The errors of the last step and the words of the first.
+    ends: (f64, u64),
 }
 
 impl Default for Totals {
     fn default() -> Self {
-        Totals { steps: vec![(0.0, 0); STEPS] }
+        Totals { turns: vec![(0.0, 0); STEPS], ends: (0.0, 0) }
     }
 }
 
 impl Totals {
     /// Adds a brick.
-    pub fn add(&mut self, codecs: &[Codec], errors: &[Option<Error>], max_error: Option<f32>, unit: f32) {
-        // With growing λ, bricks go from cheap codecs to exact ones and never back: most steps in between are alike.
-        let pick =
-            |step: usize| choose(codecs, errors, max_error, Lambda::of_step(FIRST_STEP + step as i32, unit));
-        let mut fill = vec![(0, STEPS - 1, pick(0), pick(STEPS - 1))];
-        while let Some((low, high, at_low, at_high)) = fill.pop() {
-            if at_low == at_high || high - low <= 1 {
-                (low..=high).for_each(|step| {
-                    let i = if step == high { at_high } else { at_low };
-                    // The ends of a part belong to the part that begins there.
-                    if step < high || high == STEPS - 1 {
-                        let error = errors[i].map_or(0.0, |error| f64::from(error.squared));
-                        self.steps[step].0 += error;
-                        self.steps[step].1 += codecs[i].word_count() as u64;
-                    }
-                });
-            } else {
-                let middle = low.midpoint(high);
-                let at_middle = pick(middle);
-                fill.push((low, middle, at_low, at_middle));
-                fill.push((middle, high, at_middle, at_high));
+    pub fn add(&mut self, curve: &Curve) {
+        let first = curve.at(Lambda::of_step(0));
+        let begin = curve.0.iter().position(|candidate| *candidate == first).unwrap_or(0);
+        self.ends.1 += first.codec.word_count() as u64;
+        let mut last = first;
+        for fine in &curve.0[begin + 1..] {
+            let octaves = turn(&last, fine).log2() * f64::from(STEPS_PER_OCTAVE) - f64::from(FIRST_STEP);
+            // Logarithms are rounded: what counts is which costs less.
+            let is_reached =
+                |step: usize| fine.cost(Lambda::of_step(step)) < last.cost(Lambda::of_step(step));
+            let mut step = octaves.ceil().clamp(1.0, STEPS as f64) as usize;
+            while step > 1 && is_reached(step - 1) {
+                step -= 1;
             }
+            while step < STEPS && !is_reached(step) {
+                step += 1;
+            }
+            let Some(turn) = self.turns.get_mut(step) else { break };
+            turn.0 += last.error.squared - fine.error.squared;
+            turn.1 += (fine.codec.word_count() - last.codec.word_count()) as u64;
+            last = *fine;
         }
+        self.ends.0 += last.error.squared;
+    }
+
+    /// The squared error and the words of each step.
+    fn steps(&self) -> Vec<(f64, u64)> {
+        let mut steps = self.turns.clone();
+        let mut words = self.ends.1;
+        for step in &mut steps {
+            words += step.1;
+            step.1 = words;
+        }
+        // From the smallest sum to the largest, so that none is what is left of a difference.
+        let mut squared = self.ends.0;
+        for step in steps.iter_mut().rev() {
+            (squared, step.0) = (squared + step.0, squared);
+        }
+        steps
     }
 
     /// Adds what others have added up.
     pub fn merge(&mut self, other: &Totals) {
-        for (total, other) in self.steps.iter_mut().zip(&other.steps) {
-            *total = (total.0 + other.0, total.1 + other.1);
+        for (turn, other) in self.turns.iter_mut().zip(&other.turns).chain([(&mut self.ends, &other.ends)]) {
+            *turn = (turn.0 + other.0, turn.1 + other.1);
         }
     }
 
     /// The λ that meets a target. If none does, that of the least error.
-    pub fn lambda(&self, target: &Target, unit: f32) -> Lambda {
+    pub fn lambda(&self, target: &Target) -> Lambda {
         if *target == Target::default() {
             return Lambda::NONE;
         }
+        let steps = self.steps();
         let fine_enough =
             |(squared, _): &(f64, u64)| target.squared_error.is_none_or(|limit| *squared <= limit);
         let too_large = |(_, words): &(f64, u64)| target.words.is_some_and(|limit| *words > limit);
         let fine = match target.squared_error {
-            Some(_) => self.steps.iter().position(fine_enough).unwrap_or(STEPS - 1),
+            Some(_) => steps.iter().position(fine_enough).unwrap_or(STEPS - 1),
             None => STEPS - 1,
         };
-        let small = self.steps.iter().position(too_large).map_or(STEPS - 1, |step| step.saturating_sub(1));
-        Lambda::of_step(FIRST_STEP + fine.min(small) as i32, unit)
+        let small = steps.iter().position(too_large).map_or(STEPS - 1, |step| step.saturating_sub(1));
+        Lambda::of_step(fine.min(small))
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::quantize::{CODECS, ChannelScale, measure};
+    use super::super::quantize::{Brick, CODECS, ChannelScale};
     use super::*;
 
-    fn bricks() -> Vec<Vec<Option<Error>>> {
-        let scale = ChannelScale {
-            unit: 1.0,
-            floor: 0.0,
-            background: 0.0,
-            background_tolerance: 1e-3,
-            keeps_sign: false,
-        };
+    const SCALE: ChannelScale = ChannelScale {
+        unit: 1.0,
+        floor: 0.0,
+        background: 0.0,
+        background_tolerance: 1e-3,
+        keeps_sign: false,
+    };
+
+    fn bricks() -> Vec<Brick> {
         let wave =
             |i: usize, brick: usize| ((i * i * (brick + 3)) as f32 * 0.001).sin() * 0.4 / (1 + brick) as f32;
-        let brick = |brick: usize| std::array::from_fn(|i| 0.5 + wave(i, brick));
-        (0..40).map(|i| measure(&brick(i), &CODECS, &scale)).collect()
+        (0..40).map(|brick| std::array::from_fn(|i| 0.5 + wave(i, brick))).collect()
     }
 
-    fn spent(bricks: &[Vec<Option<Error>>], max_error: Option<f32>, lambda: Lambda) -> (f64, f32, u64) {
-        bricks.iter().fold((0.0, 0.0, 0), |(squared, max, words), errors| {
-            let i = choose(&CODECS, errors, max_error, lambda);
-            let error = errors[i].unwrap();
-            (squared + f64::from(error.squared), error.max.max(max), words + CODECS[i].word_count() as u64)
+    fn curve(brick: &Brick, max_error: Option<f32>, largest: Lambda) -> Curve {
+        Curve::of(&mut Measure::of(brick, &SCALE), &CODECS, max_error, largest)
+    }
+
+    /// The least that a brick costs, tried codec by codec.
+    fn least(brick: &Brick, max_error: Option<f32>, lambda: Lambda) -> f64 {
+        let mut measure = Measure::of(brick, &SCALE);
+        let candidates = CODECS.iter().filter_map(|codec| {
+            let error =
+                measure.error(*codec).filter(|error| max_error.is_none_or(|bound| error.max <= bound))?;
+            Some(Candidate { codec: *codec, error }.cost(lambda))
+        });
+        candidates.fold(f64::INFINITY, f64::min)
+    }
+
+    fn spent(bricks: &[Brick], max_error: Option<f32>, lambda: Lambda) -> (f64, f32, u64) {
+        bricks.iter().fold((0.0, 0.0, 0), |(squared, max, words), brick| {
+            let Candidate { codec, error } = curve(brick, max_error, lambda).at(lambda);
+            (squared + error.squared, error.max.max(max), words + codec.word_count() as u64)
         })
+    }
+
+    #[test]
+    fn a_curve_has_the_best_codec_for_every_lambda() {
+        for brick in &bricks()[..4] {
+            for max_error in [None, Some(0.1), Some(1e-3)] {
+                let whole = curve(brick, max_error, Lambda::LARGEST);
+                for step in (0..STEPS).step_by(23) {
+                    let lambda = Lambda::of_step(step);
+                    let least = least(brick, max_error, lambda);
+                    assert!((whole.at(lambda).cost(lambda) - least).abs() <= 1e-9 * least, "step {step}");
+                    assert_eq!(curve(brick, max_error, lambda).at(lambda), whole.at(lambda), "step {step}");
+                }
+            }
+        }
     }
 
     #[test]
@@ -160,22 +285,20 @@ mod tests {
     #[test]
     fn totals_are_what_each_lambda_leads_to_and_targets_are_met() {
         let bricks = bricks();
-        for (unit, max_error) in [(1.0, None), (1.0, Some(0.05)), (0.25, None)] {
+        for max_error in [None, Some(0.05)] {
             let mut totals = Totals::default();
-            bricks.iter().for_each(|errors| totals.add(&CODECS, errors, max_error, unit));
-            for (step, (squared, words)) in totals.steps.iter().enumerate() {
-                let lambda = Lambda::of_step(FIRST_STEP + step as i32, unit);
-                let expected = spent(&bricks, max_error, lambda);
-                assert!(
-                    (squared - expected.0).abs() <= 1e-6 * squared && *words == expected.2,
-                    "step {step}"
-                );
+            bricks.iter().for_each(|brick| totals.add(&curve(brick, max_error, Lambda::LARGEST)));
+            for (step, (squared, words)) in totals.steps().into_iter().enumerate() {
+                let expected = spent(&bricks, max_error, Lambda::of_step(step));
+                assert!((squared - expected.0).abs() <= 1e-9 * squared && words == expected.2, "step {step}");
             }
-            let of = |target: Target| spent(&bricks, max_error, totals.lambda(&target, unit));
+            let of = |target: Target| spent(&bricks, max_error, totals.lambda(&target));
             let error = |limit: f64| of(Target { squared_error: Some(limit), words: None });
             for limit in [1e-4, 1e-3, 0.1, 10.0] {
                 let (squared, _, words) = error(limit);
                 assert!(squared <= limit && error(limit * 10.0).2 <= words);
+                let sure = Lambda::sure(bricks.len() as u64, limit);
+                assert!(totals.lambda(&Target { squared_error: Some(limit), words: None }) <= sure);
             }
             let cheapest = spent(&bricks, max_error, Lambda::NONE).2;
             for limit in [cheapest, 1000 + cheapest, 3000 + cheapest] {

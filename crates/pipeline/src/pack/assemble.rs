@@ -15,8 +15,9 @@ use nuage_volume::packed::TreeRef;
 use nuage_volume::packed::build::{EntryScale, Packer, TooLarge};
 use nuage_volume::space::BRICK_VOXELS;
 
-use super::frame::{EncodedFrame, EncodedLevel, Options, map};
+use super::frame::{EncodedFrame, EncodedLevel, Options};
 use super::plan::Plan;
+use crate::each;
 use crate::encode::quantize::ChannelScale;
 
 /// Why a file cannot be put together.
@@ -140,10 +141,11 @@ impl<'c, W: Write + Seek> Assembler<'c, W> {
             .map(|((place, codec, end), begin)| (*place, *codec, &level.words[begin..*end]))
             .collect();
         // Trees know of no background but zero: they are built of what values differ from it.
-        let summaries = map(&bricks, |(_, codec, words)| {
+        let summaries = each(bricks.len(), |i| {
+            let (_, codec, words) = bricks[i];
             let mut values = [background; BRICK_VOXELS];
             let context = BrickContext { words, shapes: &[], unit: scale.unit, floor: scale.floor };
-            let decoded = context.decode(*codec, 0, &mut values);
+            let decoded = context.decode(codec, 0, &mut values);
             debug_assert!(decoded.is_ok(), "what was encoded decodes");
             values.iter_mut().for_each(|value| *value -= background);
             BrickSummary::of(&values)

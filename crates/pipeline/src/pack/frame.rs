@@ -13,8 +13,9 @@ use nuage_volume::format::Quality;
 
 use super::level::{Level, Tile};
 use super::plan::{ChannelPlan, ChannelTree, Plan, channel_trees};
-use crate::encode::choose::{Lambda, Target, Totals, choose};
-use crate::encode::quantize::{CODECS, ChannelScale, constant, measure, write};
+use crate::each;
+use crate::encode::choose::{Candidate, Curve, Lambda, Target, Totals};
+use crate::encode::quantize::{Brick, CODECS, ChannelScale, Error, Measure, constant, write};
 use crate::import::linear_transform;
 
 /// How large an error may be.
@@ -121,7 +122,7 @@ pub enum EncodeError {
     NotPlanned(String),
 }
 
-/// Encodes the grids of a frame.
+/// Encodes the grids of a frame. `weighed` is what [`weigh_frame`] found, if it is still there.
 ///
 /// # Errors
 /// If a grid is not in the plan or its header cannot be written.
@@ -130,11 +131,14 @@ pub fn encode_frame(
     metadata: &Metadata,
     plan: &Plan,
     options: &Options,
+    weighed: Option<&[WeighedChannel]>,
 ) -> Result<EncodedFrame, EncodeError> {
     let (trees, _) = channel_trees(grids);
-    let encode =
-        |channel: ChannelTree| encode_channel(&grids[channel.grid], channel, metadata, plan, options);
-    Ok(EncodedFrame { grids: trees.into_iter().map(encode).collect::<Result<_, _>>()? })
+    let encode = |(i, channel): (usize, ChannelTree)| {
+        let curves = weighed.and_then(|weighed| Some(weighed.get(i)?.curves.as_slice()));
+        encode_channel(&grids[channel.grid], channel, metadata, plan, options, curves)
+    };
+    Ok(EncodedFrame { grids: trees.into_iter().enumerate().map(encode).collect::<Result<_, _>>()? })
 }
 
 fn encode_channel(
@@ -143,21 +147,22 @@ fn encode_channel(
     metadata: &Metadata,
     plan: &Plan,
     options: &Options,
+    curves: Option<&[Curve]>,
 ) -> Result<EncodedGrid, EncodeError> {
     let ChannelTree { key, tree, .. } = channel;
     let index = plan.find(&key).ok_or_else(|| EncodeError::NotPlanned(key.grid.clone()))?;
     let planned = &plan.channels[index];
     let scale = planned.scale(tree.background);
-    let choice = Choice::new(planned, options);
+    let choice = Choice::new(planned, options, planned.lambda);
     let offset = index_offset(&tree);
     let mut level = Level::of(&tree, offset >> 3);
     let (voxels, source_bricks) = (level.voxels(tree.background), level.bricks.len() as u64);
-    let (encoded, error) = encode_level(&level, &scale, &choice);
+    let (encoded, error) = encode_level(&level, &scale, &choice, curves);
     let mut levels = vec![encoded];
     for _ in 0..options.coarser_levels {
         let Some(coarser) = level.coarser(tree.background) else { break };
         level = coarser;
-        levels.push(encode_level(&level, &scale, &choice).0);
+        levels.push(encode_level(&level, &scale, &choice, None).0);
     }
     let world_from_index =
         linear_transform(&grid.name, &grid.transform).ok().map(|affine| affine.to_cols_array());
@@ -169,7 +174,11 @@ fn encode_channel(
         active_box: tree.active_bbox(),
         world_from_index,
         source_header: source_header(grid, metadata)?,
-        quality: Quality { max_error: error.1, squared_error: error.0, voxels },
+        quality: Quality {
+            max_error: error.max,
+            squared_error: error.squared * f64::from(scale.unit).powi(2),
+            voxels,
+        },
         source_bricks,
     })
 }
@@ -218,107 +227,126 @@ struct Choice {
 }
 
 impl Choice {
-    fn new(planned: &ChannelPlan, options: &Options) -> Choice {
+    fn new(planned: &ChannelPlan, options: &Options, lambda: Lambda) -> Choice {
         match options.codec {
             // A codec that is asked for is not weighed against others; what it cannot hold takes more.
             Some(codec) => {
                 let codecs = vec![codec, Codec::Uniform { bits: 8 }, Codec::F32];
-                Choice { codecs, is_forced: true, max_error: None, lambda: Lambda::NONE }
+                Choice { codecs, is_forced: true, max_error: None, lambda }
             }
             None => Choice {
                 codecs: CODECS.to_vec(),
                 is_forced: false,
                 max_error: options.max_error.map(|bound| bound.of(planned.peak())),
-                lambda: planned.lambda,
+                lambda,
             },
         }
     }
-}
 
-/// What each weight of error leads to in one channel of a frame.
-#[derive(Debug, Clone)]
-pub struct ChannelTotals {
-    /// The index of the channel in the plan.
-    pub channel: usize,
-    /// Words and errors.
-    pub totals: Totals,
-    /// Voxels that are not background.
-    pub voxels: u64,
-    /// Bricks that are not constant.
-    pub bricks: u64,
+    /// The codecs that are the best for a brick with some λ up to that of the choice.
+    fn curve(&self, brick: &Brick, scale: &ChannelScale) -> Curve {
+        Curve::of(&mut Measure::of(brick, scale), &self.codecs, self.max_error, self.lambda)
+    }
+
+    fn best(&self, brick: &Brick, scale: &ChannelScale) -> Candidate {
+        if !self.is_forced {
+            return self.curve(brick, scale).at(self.lambda);
+        }
+        let mut measure = Measure::of(brick, scale);
+        let mut held = self
+            .codecs
+            .iter()
+            .filter_map(|codec| Some(Candidate { codec: *codec, error: measure.error(*codec)? }));
+        held.next().unwrap_or(Candidate { codec: Codec::F32, error: Error::default() })
+    }
 }
 
 /// The words that the tree takes for a brick: an entry of two, and its part of nodes, masks and entries that are no
 /// bricks.
 const ENTRY_WORDS: f64 = 3.0;
 
-impl ChannelTotals {
-    /// Adds what another frame has.
-    pub fn merge(&mut self, other: &ChannelTotals) {
-        self.totals.merge(&other.totals);
-        self.voxels += other.voxels;
-        self.bricks += other.bricks;
-    }
-
-    /// The weight with which the channel meets what is asked of it.
-    pub fn lambda(&self, planned: &ChannelPlan, options: &Options) -> Lambda {
-        let peak = f64::from(planned.peak());
-        let target = Target {
-            squared_error: options
-                .psnr
-                .map(|decibels| self.voxels as f64 * peak.powi(2) / 10.0_f64.powf(decibels / 10.0)),
-            words: options
-                .bits_per_voxel
-                .map(|bits| ((bits * 16.0 - ENTRY_WORDS) * self.bricks as f64).max(0.0) as u64),
-        };
-        self.totals.lambda(&target, planned.scale(0.0).unit)
+/// What a channel's bricks have to keep to, over all frames, squared errors in its unit.
+fn target(planned: &ChannelPlan, options: &Options) -> Target {
+    let scale = planned.scale(0.0);
+    let peak = f64::from(planned.peak() / scale.unit);
+    Target {
+        squared_error: options
+            .psnr
+            .map(|decibels| planned.voxels as f64 * peak.powi(2) / 10.0_f64.powf(decibels / 10.0)),
+        words: options
+            .bits_per_voxel
+            .map(|bits| ((bits * 16.0 - ENTRY_WORDS) * planned.bricks as f64).max(0.0) as u64),
     }
 }
 
-/// Adds up what each weight of error would lead to in a frame.
-pub fn frame_totals(grids: &[Grid], plan: &Plan, options: &Options) -> Vec<ChannelTotals> {
-    let total = |channel: ChannelTree| {
-        let index = plan.find(&channel.key)?;
+/// The λ with which a channel meets what is asked of it, from the sums over all its bricks.
+pub fn settle(totals: &Totals, planned: &ChannelPlan, options: &Options) -> Lambda {
+    totals.lambda(&target(planned, options))
+}
+
+/// What each λ leads to in one channel of a frame.
+#[derive(Debug, Clone)]
+pub struct WeighedChannel {
+    /// The index of the channel in the plan.
+    pub channel: usize,
+    /// The sums over its bricks.
+    pub totals: Totals,
+    /// The codecs worth choosing for each brick, with any λ that may come out.
+    pub curves: Vec<Curve>,
+}
+
+/// Finds what each λ would lead to in a frame.
+///
+/// # Errors
+/// If a grid is not in the plan.
+pub fn weigh_frame(
+    grids: &[Grid],
+    plan: &Plan,
+    options: &Options,
+) -> Result<Vec<WeighedChannel>, EncodeError> {
+    let weigh = |tree: ChannelTree| {
+        let index = plan.find(&tree.key).ok_or_else(|| EncodeError::NotPlanned(tree.key.grid.clone()))?;
         let planned = &plan.channels[index];
-        let scale = planned.scale(channel.tree.background);
-        let Choice { codecs, max_error, .. } = Choice::new(planned, options);
-        let level = Level::of(&channel.tree, IVec3::ZERO);
-        let parts: Vec<_> = level.bricks.chunks(512).collect();
-        // Parts and not bricks, since sums depend on their order.
-        let totals = map(&parts, |bricks| {
-            let mut totals = Totals::default();
-            for brick in *bricks {
-                totals.add(&codecs, &measure(brick, &codecs, &scale), max_error, scale.unit);
-            }
-            totals
-        });
-        let mut sum = Totals::default();
-        totals.iter().for_each(|totals| sum.merge(totals));
-        let (voxels, bricks) = (level.voxels(channel.tree.background), level.bricks.len() as u64);
-        Some(ChannelTotals { channel: index, totals: sum, voxels, bricks })
+        let scale = planned.scale(tree.tree.background);
+        let largest = match target(planned, options).squared_error {
+            Some(squared) => Lambda::sure(planned.bricks, squared),
+            None => Lambda::LARGEST,
+        };
+        let choice = Choice::new(planned, options, largest);
+        let level = Level::of(&tree.tree, IVec3::ZERO);
+        let curves = each(level.bricks.len(), |i| choice.curve(&level.bricks[i], &scale));
+        // In the order of bricks, on which sums depend.
+        let mut totals = Totals::default();
+        curves.iter().for_each(|curve| totals.add(curve));
+        Ok(WeighedChannel { channel: index, totals, curves })
     };
-    channel_trees(grids).0.into_iter().filter_map(total).collect()
+    channel_trees(grids).0.into_iter().map(weigh).collect()
 }
 
-/// Encodes the bricks of a level. Gives the sum of their squared errors and the largest error as well.
-fn encode_level(level: &Level, scale: &ChannelScale, choice: &Choice) -> (EncodedLevel, (f64, f32)) {
-    let Choice { codecs, is_forced, max_error, lambda } = choice;
-    let coded = map(&level.bricks, |brick| {
-        let errors = measure(brick, codecs, scale);
-        let i = match is_forced {
-            true => errors.iter().position(Option::is_some).unwrap_or(codecs.len() - 1),
-            false => choose(codecs, &errors, *max_error, *lambda),
+/// Encodes the bricks of a level, by their curves if these are known. Gives the sum of their squared errors, in units
+/// of the channel, and the largest error as well.
+fn encode_level(
+    level: &Level,
+    scale: &ChannelScale,
+    choice: &Choice,
+    curves: Option<&[Curve]>,
+) -> (EncodedLevel, Error) {
+    let coded = each(level.bricks.len(), |i| {
+        let brick = &level.bricks[i];
+        let best = match curves {
+            Some(curves) => curves[i].at(choice.lambda),
+            None => choice.best(brick, scale),
         };
-        let mut words = Vec::with_capacity(codecs[i].word_count());
-        write(brick, codecs[i], scale, &mut words);
-        (codecs[i], errors[i], words)
+        let mut words = Vec::with_capacity(best.codec.word_count());
+        write(brick, best.codec, scale, &mut words);
+        (best, words)
     });
     let mut encoded = EncodedLevel { tiles: level.tiles.clone(), ..EncodedLevel::default() };
-    let mut total = (0.0, 0.0_f32);
-    for ((place, brick), (codec, error, words)) in level.places.iter().zip(&level.bricks).zip(coded) {
-        if let Some(error) = error {
-            total = (total.0 + f64::from(error.squared), total.1.max(error.max));
-        }
+    let mut total = Error::default();
+    for ((place, brick), (Candidate { codec, error }, words)) in
+        level.places.iter().zip(&level.bricks).zip(coded)
+    {
+        total = Error { squared: total.squared + error.squared, max: total.max.max(error.max) };
         match codec {
             Codec::Constant => {
                 let value = constant(brick, scale);
@@ -333,17 +361,4 @@ fn encode_level(level: &Level, scale: &ChannelScale, choice: &Choice) -> (Encode
         }
     }
     (encoded, total)
-}
-
-/// The results for all items, in order, on all threads where the feature `parallel` says so.
-pub(crate) fn map<T: Sync, R: Send>(items: &[T], run: impl Fn(&T) -> R + Sync + Send) -> Vec<R> {
-    #[cfg(feature = "parallel")]
-    {
-        use rayon::prelude::*;
-        items.par_iter().with_min_len(16).map(run).collect()
-    }
-    #[cfg(not(feature = "parallel"))]
-    {
-        items.iter().map(run).collect()
-    }
 }

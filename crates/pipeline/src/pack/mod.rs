@@ -1,8 +1,9 @@
 //! From grids to packed volumes and back.
 //!
-//! Packing goes through a sequence twice. [`plan`] notes the range of each channel over all frames; then [`frame`]
-//! encodes each frame on its own, and [`assemble`] puts frames one after the other into a file, where what they have in
-//! common stands once; [`sequence`] does both. [`level`] makes the coarser levels of a tree, [`unpack`] makes grids of a packed frame again.
+//! Packing goes through a sequence up to three times. [`plan`] notes the range of each channel over all frames;
+//! [`frame`] weighs what errors cost, where a ratio or a size is asked for, and then encodes each frame on its own;
+//! [`assemble`] puts frames one after the other into a file, where what they have in common stands once. [`sequence`]
+//! does one after the other. [`level`] makes the coarser levels of a tree, [`unpack`] makes grids of a packed frame again.
 //!
 //! A grid becomes a channel, a vector grid three. Values keep their meaning: a level set stays one. What does not
 //! fit (points, strings, trees of other shapes) is named in a warning and left out. Which codec a brick gets is

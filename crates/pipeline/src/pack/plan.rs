@@ -1,9 +1,12 @@
 //! What has to be known of a sequence before its first frame is encoded: its channels, and the range of each.
 
+use std::borrow::Cow;
+
 use nuage_vdb::{AnyTree, Grid, Shape, Tree};
 use nuage_volume::format::Role;
-use rayon_or_not::map_slice;
+use nuage_volume::space::BRICK_VOXELS;
 
+use crate::each;
 use crate::encode::choose::Lambda;
 use crate::encode::quantize::ChannelScale;
 
@@ -35,6 +38,10 @@ pub struct ChannelPlan {
     pub min: f32,
     /// The largest value over all frames, the background included.
     pub max: f32,
+    /// The voxels of bricks that are not constant, those that differ from the background, over all frames.
+    pub voxels: u64,
+    /// The bricks that are not constant, over all frames.
+    pub bricks: u64,
     /// The weight of errors with which the channel meets what is asked of it.
     pub lambda: Lambda,
 }
@@ -50,13 +57,13 @@ pub struct Plan {
 
 /// One channel of a frame: single-precision numbers in a standard tree.
 #[derive(Debug, Clone)]
-pub struct ChannelTree {
+pub struct ChannelTree<'g> {
     /// Which channel.
     pub key: ChannelKey,
     /// The index of the grid it comes from.
     pub grid: usize,
     /// The values.
-    pub tree: Tree<f32>,
+    pub tree: Cow<'g, Tree<f32>>,
 }
 
 impl ChannelPlan {
@@ -85,8 +92,8 @@ impl Plan {
     pub fn note(&mut self, grids: &[Grid]) {
         let (trees, left_out) = channel_trees(grids);
         let channels = trees.into_iter().map(|ChannelTree { key, grid, tree }| {
-            let (min, max) = range(&tree);
-            ChannelPlan { key, role: role(&grids[grid]), min, max, lambda: Lambda::NONE }
+            let Survey { min, max, voxels, bricks } = survey(&tree);
+            ChannelPlan { key, role: role(&grids[grid]), min, max, voxels, bricks, lambda: Lambda::NONE }
         });
         self.merge(Plan { channels: channels.collect(), left_out });
     }
@@ -102,6 +109,8 @@ impl Plan {
             match self.channels.iter_mut().find(|channel| channel.key == found.key) {
                 Some(channel) => {
                     (channel.min, channel.max) = (channel.min.min(found.min), channel.max.max(found.max));
+                    channel.voxels += found.voxels;
+                    channel.bricks += found.bricks;
                 }
                 None => self.channels.push(found),
             }
@@ -115,7 +124,7 @@ impl Plan {
 }
 
 /// The channels of the grids of a frame, and what of them cannot be one.
-pub fn channel_trees(grids: &[Grid]) -> (Vec<ChannelTree>, Vec<String>) {
+pub fn channel_trees(grids: &[Grid]) -> (Vec<ChannelTree<'_>>, Vec<String>) {
     let (mut trees, mut left_out) = (Vec::new(), Vec::new());
     for (i, grid) in grids.iter().enumerate() {
         let repeat = grids[..i].iter().filter(|other| other.name == grid.name).count() as u32;
@@ -130,14 +139,16 @@ pub fn channel_trees(grids: &[Grid]) -> (Vec<ChannelTree>, Vec<String>) {
                 ));
             }
             AnyTree::Vec3s(tree) => {
-                (0..3).for_each(|c| add(Some(c as u8), tree.map(|value| finite(value[c]))));
+                (0..3).for_each(|c| add(Some(c as u8), Cow::Owned(tree.map(|value| finite(value[c])))));
             }
             AnyTree::Vec3d(tree) => {
-                (0..3).for_each(|c| add(Some(c as u8), tree.map(|value| finite(value[c] as f32))));
+                let component = |c: usize| tree.map(|value| finite(value[c] as f32));
+                (0..3).for_each(|c| add(Some(c as u8), Cow::Owned(component(c))));
             }
-            AnyTree::Float(tree) => add(None, tree.map(finite)),
-            AnyTree::Double(tree) => add(None, tree.map(|value| finite(value as f32))),
-            AnyTree::Half(tree) => add(None, tree.map(|value| finite(value.to_f32()))),
+            AnyTree::Float(tree) if is_finite(tree) => add(None, Cow::Borrowed(tree)),
+            AnyTree::Float(tree) => add(None, Cow::Owned(tree.map(finite))),
+            AnyTree::Double(tree) => add(None, Cow::Owned(tree.map(|value| finite(value as f32)))),
+            AnyTree::Half(tree) => add(None, Cow::Owned(tree.map(|value| finite(value.to_f32())))),
             other => {
                 left_out.push(format!("grid '{}': values of type {}", grid.name, other.value_type()));
             }
@@ -151,19 +162,57 @@ fn finite(value: f32) -> f32 {
     if value.is_nan() { 0.0 } else { value.clamp(-LARGEST, LARGEST) }
 }
 
-fn range(tree: &Tree<f32>) -> (f32, f32) {
-    let of = |values: &[f32]| {
-        values.iter().fold((f32::INFINITY, f32::NEG_INFINITY), |(min, max), value| {
-            (if *value < min { *value } else { min }, if *value > max { *value } else { max })
-        })
-    };
-    let leaves = map_slice(&tree.leaves.values, 1 << 16, of);
+/// Whether [`finite`] would change no value of a tree.
+fn is_finite(tree: &Tree<f32>) -> bool {
+    let all = |values: &[f32]| values.iter().fold(true, |all, value| all & (value.abs() <= LARGEST));
+    let leaves = tree.leaves.values.chunks(1 << 12).all(all);
+    leaves && tile_values(tree).all(|value| value.abs() <= LARGEST)
+}
+
+/// The values of all tiles and the background.
+fn tile_values(tree: &Tree<f32>) -> impl Iterator<Item = f32> {
     let tiles = tree.inner_nodes().flat_map(|(_, node)| node.tile_slots().map(|(_, value, _)| value));
-    let others = tiles.chain(tree.root_tiles.iter().map(|tile| tile.value)).chain([tree.background]);
-    leaves
-        .into_iter()
-        .chain(others.map(|value| (value, value)))
-        .fold((f32::INFINITY, f32::NEG_INFINITY), |(min, max), (low, high)| (min.min(low), max.max(high)))
+    tiles.chain(tree.root_tiles.iter().map(|tile| tile.value)).chain([tree.background])
+}
+
+/// What there is to know of a tree before it is encoded.
+struct Survey {
+    min: f32,
+    max: f32,
+    /// Of bricks that are not constant: the voxels that differ from the background.
+    voxels: u64,
+    /// Bricks that are not constant.
+    bricks: u64,
+}
+
+fn survey(tree: &Tree<f32>) -> Survey {
+    const EMPTY: Survey = Survey { min: f32::INFINITY, max: f32::NEG_INFINITY, voxels: 0, bricks: 0 };
+    let add = |sum: Survey, part: Survey| Survey {
+        min: sum.min.min(part.min),
+        max: sum.max.max(part.max),
+        voxels: sum.voxels + part.voxels,
+        bricks: sum.bricks + part.bricks,
+    };
+    let brick = |values: &[f32; BRICK_VOXELS]| {
+        let mut found = EMPTY;
+        for value in values {
+            found.min = if *value < found.min { *value } else { found.min };
+            found.max = if *value > found.max { *value } else { found.max };
+            found.voxels += u64::from(*value != tree.background);
+        }
+        match found.min < found.max {
+            true => Survey { bricks: 1, ..found },
+            false => Survey { voxels: 0, ..found },
+        }
+    };
+    const AT_ONCE: usize = 256;
+    let bricks = tree.leaves.values.as_chunks::<BRICK_VOXELS>().0;
+    let chunk = |i: usize| {
+        let end = bricks.len().min((i + 1) * AT_ONCE);
+        bricks[i * AT_ONCE..end].iter().map(brick).fold(EMPTY, add)
+    };
+    let leaves = each(bricks.len().div_ceil(AT_ONCE), chunk).into_iter().fold(EMPTY, add);
+    tile_values(tree).map(|value| Survey { min: value, max: value, ..EMPTY }).fold(leaves, add)
 }
 
 /// What the values of a grid are, by its class and its name.
@@ -180,25 +229,5 @@ pub fn role(grid: &Grid) -> Role {
         _ if has(&["flame", "fire", "fuel"]) => Role::Flame,
         _ if has(&["density", "smoke", "fog", "cloud"]) => Role::Density,
         _ => Role::Other,
-    }
-}
-
-/// Running over parts of a slice, in parallel where the feature says so.
-mod rayon_or_not {
-    /// The results of chunks of a slice, in order.
-    pub(super) fn map_slice<T: Sync, R: Send>(
-        items: &[T],
-        chunk: usize,
-        run: impl Fn(&[T]) -> R + Sync + Send,
-    ) -> Vec<R> {
-        #[cfg(feature = "parallel")]
-        {
-            use rayon::prelude::*;
-            items.par_chunks(chunk).map(run).collect()
-        }
-        #[cfg(not(feature = "parallel"))]
-        {
-            items.chunks(chunk).map(run).collect()
-        }
     }
 }

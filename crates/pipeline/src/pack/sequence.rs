@@ -1,18 +1,18 @@
 //! Packing a sequence: all its frames, looked through for their range, weighed for what errors cost if a ratio or a size
 //! is asked for, and then encoded, a few at a time.
 //!
-//! Memory holds as many frames as there are threads, the trees and a digest of each brick. What comes out does not
-//! depend on the number of threads.
+//! Memory holds at most a GiB of frames that are wanted again, else as many frames as there are threads, the trees and a
+//! digest of each brick. What comes out does not depend on the number of threads.
 
-use std::borrow::Cow;
 use std::io::{Seek, Write};
 
 use nuage_vdb::{Grid, Metadata};
 
 use super::assemble::{AssembleError, Assembler, Report};
-use super::frame::{ChannelTotals, EncodeError, EncodedFrame, Options, encode_frame, frame_totals};
+use super::frame::{EncodeError, EncodedFrame, Options, WeighedChannel, encode_frame, settle, weigh_frame};
 use super::plan::Plan;
-use crate::encode::choose::Lambda;
+use crate::each;
+use crate::encode::choose::Totals;
 
 /// A frame's number, if it has one, and the name of its source.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -53,15 +53,6 @@ pub fn pack<E: Send, W: Write + Seek>(
     frame_rate: Option<f64>,
     done: &mut dyn FnMut(f64),
 ) -> Result<(Report, Plan), PackError<E>> {
-    // A still is loaded once.
-    let kept = match frames.len() {
-        1 => Some(load(0).map_err(PackError::Load)?),
-        _ => None,
-    };
-    let with_frame = |frame: usize| match &kept {
-        Some(kept) => Ok(Cow::Borrowed(kept)),
-        None => load(frame).map(Cow::Owned).map_err(PackError::Load),
-    };
     let is_weighed = options.codec.is_none() && (options.psnr.is_some() || options.bits_per_voxel.is_some());
     let passes = if is_weighed { 3 } else { 2 };
     let mut finished = 0;
@@ -69,52 +60,80 @@ pub fn pack<E: Send, W: Write + Seek>(
         finished += count;
         done(finished as f64 / (passes * frames.len()) as f64);
     };
+    // What the passes keep of each frame for the next.
+    let mut kept: Vec<Kept> = frames.iter().map(|_| Kept::default()).collect();
+    let mut kept_bytes = 0;
+    let loaded = |kept: &Kept, frame: usize| match &kept.loaded {
+        Some(loaded) => Ok(loaded.clone()),
+        None => load(frame).map_err(PackError::Load),
+    };
 
     let mut plan = Plan::default();
     for window in windows(frames.len()) {
-        let looked = each(window.clone(), |frame| -> Result<Plan, PackError<E>> {
+        let looked = each(window.len(), |i| -> Result<(Plan, Loaded), PackError<E>> {
+            let loaded = load(window.start + i).map_err(PackError::Load)?;
             let mut plan = Plan::default();
-            plan.note(&with_frame(frame)?.0);
-            Ok(plan)
+            plan.note(&loaded.0);
+            Ok((plan, loaded))
         });
-        looked.into_iter().try_for_each(|found| found.map(|found| plan.merge(found)))?;
+        for (frame, looked) in window.clone().zip(looked) {
+            let (found, loaded) = looked?;
+            plan.merge(found);
+            let bytes: u64 = loaded.0.iter().map(|grid| grid.tree.memory_bytes()).sum();
+            if kept_bytes + bytes <= KEPT_BYTES || frames.len() == 1 {
+                kept_bytes += bytes;
+                kept[frame].loaded = Some(loaded);
+            }
+        }
         tell(window.len());
     }
     if is_weighed {
-        let mut sums: Vec<Option<ChannelTotals>> = vec![None; plan.channels.len()];
+        let mut sums: Vec<Totals> = plan.channels.iter().map(|_| Totals::default()).collect();
         for window in windows(frames.len()) {
-            let weighed = each(window.clone(), |frame| -> Result<_, PackError<E>> {
-                Ok(frame_totals(&with_frame(frame)?.0, &plan, options))
+            let weighed = each(window.len(), |i| -> Result<_, PackError<E>> {
+                let frame = window.start + i;
+                Ok(weigh_frame(&loaded(&kept[frame], frame)?.0, &plan, options)?)
             });
-            for totals in weighed {
-                for found in totals? {
-                    let sum = &mut sums[found.channel];
-                    match sum {
-                        Some(sum) => sum.merge(&found),
-                        None => *sum = Some(found),
-                    }
+            for (frame, weighed) in window.clone().zip(weighed) {
+                let weighed = weighed?;
+                weighed.iter().for_each(|found| sums[found.channel].merge(&found.totals));
+                if kept[frame].loaded.is_some() {
+                    kept[frame].weighed = Some(weighed);
                 }
             }
             tell(window.len());
         }
         for (channel, sum) in plan.channels.iter_mut().zip(sums) {
-            channel.lambda = sum.map_or(Lambda::NONE, |sum| sum.lambda(channel, options));
+            channel.lambda = settle(&sum, channel, options);
         }
     }
     let compress = |bytes: &[u8]| compress(bytes);
     let mut assembler = Assembler::new(out, &compress, &plan, options, frame_rate)?;
     for window in windows(frames.len()) {
-        let encoded = each(window.clone(), |frame| -> Result<EncodedFrame, PackError<E>> {
-            let loaded = with_frame(frame)?;
-            Ok(encode_frame(&loaded.0, &loaded.1, &plan, options)?)
+        let encoded = each(window.len(), |i| -> Result<EncodedFrame, PackError<E>> {
+            let frame = window.start + i;
+            let (grids, metadata) = loaded(&kept[frame], frame)?;
+            Ok(encode_frame(&grids, &metadata, &plan, options, kept[frame].weighed.as_deref())?)
         });
         for (frame, encoded) in window.clone().zip(encoded) {
             assembler.add(&encoded?, frames[frame].number, &frames[frame].name)?;
+            kept[frame] = Kept::default();
         }
         tell(window.len());
     }
     Ok((assembler.finish()?, plan))
 }
+
+/// What the passes keep of a frame: its grids, and the curves of their bricks.
+#[derive(Default)]
+struct Kept {
+    loaded: Option<Loaded>,
+    weighed: Option<Vec<WeighedChannel>>,
+}
+
+/// Frames are kept from one pass to the next as long as all that are kept have no more bytes of values than this;
+/// others are loaded and measured again. What is noted of their bricks takes a tenth beside that.
+const KEPT_BYTES: u64 = 1 << 30;
 
 /// A zstd frame of some bytes, or nothing if it cannot be made.
 #[cfg(feature = "native-zstd")]
@@ -138,16 +157,4 @@ fn windows(count: usize) -> impl Iterator<Item = std::ops::Range<usize>> {
     #[cfg(not(feature = "parallel"))]
     let width = 1;
     (0..count).step_by(width).map(move |begin| begin..count.min(begin + width))
-}
-
-fn each<R: Send>(range: std::ops::Range<usize>, run: impl Fn(usize) -> R + Sync + Send) -> Vec<R> {
-    #[cfg(feature = "parallel")]
-    {
-        use rayon::prelude::*;
-        range.into_par_iter().map(run).collect()
-    }
-    #[cfg(not(feature = "parallel"))]
-    {
-        range.map(run).collect()
-    }
 }

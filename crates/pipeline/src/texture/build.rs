@@ -15,9 +15,9 @@ use nuage_volume::space::{
 use serde::Serialize;
 
 use super::layout::{Layout, TextureFormat};
+use crate::each;
 use crate::encode::block::{self, Quality};
 use crate::encode::quantize::{self, Brick, ChannelScale};
-use crate::pack::frame::map;
 use crate::pack::plan::BACKGROUND_TOLERANCE;
 
 /// What is asked of a texture.
@@ -248,7 +248,7 @@ pub fn build(asset: &Asset, options: &Options) -> Result<BrickTexture, TextureEr
         frame_rate: contents.frame_rate,
     };
     for batch in sources.chunks(BATCH) {
-        for encoded in map(batch, |source| encoder.encode(*source)) {
+        for encoded in each(batch.len(), |i| encoder.encode(batch[i])) {
             let (scale, bytes) = encoded?;
             texture.put(&bytes);
             texture.bricks.push(scale);
@@ -278,9 +278,10 @@ impl BrickTexture {
 fn common_scale(asset: &Asset, channel: usize, sources: &[Source]) -> Result<BrickScale, TextureError> {
     let (mut low, mut high) = (0.0_f32, 0.0_f32);
     for batch in sources.chunks(BATCH) {
-        let bounds = map(batch, |(codec, offset)| -> Result<_, DecodeError> {
+        let bounds = each(batch.len(), |i| -> Result<_, DecodeError> {
+            let (codec, offset) = batch[i];
             let mut values = [0.0; BRICK_VOXELS];
-            asset.decode(channel, *codec, *offset, &mut values)?;
+            asset.decode(channel, codec, offset, &mut values)?;
             Ok(values.iter().fold((0.0_f32, 0.0_f32), |(low, high), v| (low.min(*v), high.max(*v))))
         });
         for bounds in bounds {

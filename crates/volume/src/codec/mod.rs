@@ -156,7 +156,7 @@ pub struct BrickContext<'a> {
 }
 
 /// A line of values: `at(code) = low + step × code`, one multiplication and one addition in f32.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Line {
     /// The value of code 0.
     pub low: f32,
@@ -207,7 +207,7 @@ pub fn interpolate_corners(corners: &[f32; 8], out: &mut [f32; BRICK_VOXELS]) {
 
 /// The octant of a voxel.
 pub fn octant_of(voxel: usize) -> usize {
-    voxel >> 8 & 1 << 2 | voxel >> 5 & 1 << 1 | voxel >> 2 & 1
+    (voxel >> 6 & 4) | (voxel >> 4 & 2) | (voxel >> 2 & 1)
 }
 
 /// The lines of the codes of each octant of [`Codec::Split`], from the words of their bounds.
@@ -319,6 +319,14 @@ mod tests {
         for (i, codec) in all.iter().enumerate() {
             assert_eq!(Codec::from_tag(codec.tag()), Some(*codec));
             assert!(!all[..i].contains(codec));
+        }
+    }
+
+    #[test]
+    fn octants_are_halves_along_each_axis() {
+        for voxel in 0..BRICK_VOXELS {
+            let [x, y, z] = [voxel / 64, voxel / 8 % 8, voxel % 8];
+            assert_eq!(octant_of(voxel), 4 * (x / 4) + 2 * (y / 4) + z / 4);
         }
     }
 
