@@ -35,6 +35,10 @@ pub(crate) struct PackArgs {
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=12))]
     levels: u32,
 
+    /// How many shapes the bricks of .nuage files may share at most: smaller where errors may be large, but slower
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=4096))]
+    shapes: u32,
+
     /// Frames per second, kept in .nuage files
     #[arg(long, value_name = "RATE")]
     fps: Option<f64>,
@@ -46,11 +50,12 @@ pub(crate) struct PackArgs {
 
 impl PackArgs {
     /// The names of the options that were given, which are for packed files alone.
-    pub(crate) fn given(&self) -> [(&'static str, bool); 4] {
+    pub(crate) fn given(&self) -> [(&'static str, bool); 5] {
         [
             ("--psnr", self.psnr.is_some()),
             ("--bits-per-voxel", self.bits_per_voxel.is_some()),
             ("--levels", self.levels > 0),
+            ("--shapes", self.shapes > 0),
             ("--fps", self.fps.is_some()),
         ]
     }
@@ -77,6 +82,7 @@ impl PackArgs {
             bits_per_voxel: self.bits_per_voxel,
             codec,
             coarser_levels: self.levels,
+            shapes: self.shapes,
         })
     }
 }
@@ -176,15 +182,16 @@ fn print(report: &Report, output: &Path, input_bytes: u64, seconds: f64) -> io::
         thousands(input_bytes),
         thousands(disk)
     )?;
-    let memory = report.tree_bytes + report.brick_bytes;
+    let memory = report.tree_bytes + report.brick_bytes + report.shape_bytes;
     let voxels = report.source_bricks * 512;
     let per_voxel = |bytes: u64| rounded(bytes as f64 * 8.0 / voxels.max(1) as f64, 2);
     writeln!(
         out,
-        "  in memory {} bytes: tree {}, bricks {}; {} bits per voxel of {} bricks; {} are stored",
+        "  in memory {} bytes: tree {}, bricks {}, shapes {}; {} bits per voxel of {} bricks; {} are stored",
         thousands(memory),
         thousands(report.tree_bytes),
         thousands(report.brick_bytes),
+        thousands(report.shape_bytes),
         per_voxel(memory),
         thousands(report.source_bricks),
         thousands(report.bricks_stored),

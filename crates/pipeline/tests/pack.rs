@@ -42,7 +42,7 @@ impl Packed {
 
 /// Options that ask for nothing.
 const NOTHING: Options =
-    Options { max_error: None, psnr: None, bits_per_voxel: None, codec: None, coarser_levels: 0 };
+    Options { max_error: None, psnr: None, bits_per_voxel: None, codec: None, coarser_levels: 0, shapes: 0 };
 
 fn packed(frames: &[Frame], options: &Options) -> Packed {
     let names: Vec<FrameName> = (0..frames.len())
@@ -744,6 +744,48 @@ fn equal_frames_cost_next_to_nothing_and_threads_nothing() {
     };
     let alone = of_threads(1);
     assert!([2, 3, 8].into_iter().all(|count| of_threads(count) == alone));
+}
+
+/// A row of bricks that are a wave each, of another strength and height.
+fn waves(strengths: impl Iterator<Item = f32>, unit: f32) -> Tree<f32> {
+    let mut builder = TreeBuilder::new(0.0, Shape::STANDARD);
+    for (brick, strength) in strengths.enumerate() {
+        let wave = |i: usize| {
+            let [x, y, z] = [i >> 6, i >> 3 & 7, i & 7].map(|c| c as f32 * 0.9);
+            unit * (2.0 + 0.01 * brick as f32 + strength * (x.sin() * y.cos() + (0.7 * z).sin()))
+        };
+        let values: Vec<f32> = (0..512).map(wave).collect();
+        builder.leaf([8 * brick as i32, 0, 0], &[u64::MAX; 8], &values);
+    }
+    builder.build().unwrap()
+}
+
+#[test]
+fn bricks_that_are_alike_share_a_shape() {
+    let strengths = || (0..200).map(|brick| (brick as f32 * 0.7).sin());
+    for (unit, max_error, psnr) in
+        [(1.0, Some(0.02), None), (1.0, None, Some(45.0)), (3e30, None, Some(40.0))]
+    {
+        let max_error = max_error.map(Bound::OfPeak);
+        let options = Options { max_error, psnr, ..NOTHING };
+        let frames = still(vec![grid("density", waves(strengths(), unit))]);
+        let plain = check(&frames, &options);
+        let shared = check(&frames, &Options { shapes: 16, ..options });
+        assert_eq!(plain.report.shape_bytes, 0);
+        let codecs = shared.asset.store().codecs();
+        let count = codecs.iter().filter(|codec| **codec == Codec::Shared).count();
+        assert!(count > 100 && shared.report.shape_bytes > 0, "{count} of {}", codecs.len());
+        let bytes = |packed: &Packed| packed.report.brick_bytes + packed.report.shape_bytes;
+        assert!(2 * bytes(&shared) < bytes(&plain), "{} of {}", bytes(&shared), bytes(&plain));
+    }
+}
+
+#[test]
+fn the_ratio_holds_for_values_whose_squares_vanish() {
+    let options = Options { psnr: Some(45.0), ..NOTHING };
+    let strengths = (0..20).map(|brick| brick as f32 * 0.1);
+    let packed = check(&still(vec![grid("density", waves(strengths, 1e-30))]), &options);
+    assert!(packed.report.brick_bytes > 0);
 }
 
 #[test]

@@ -10,7 +10,7 @@
 
 use std::collections::BinaryHeap;
 
-use super::{BRICK_VOXELS, Brick, LANES, centred, choose, is_tame, map, sum};
+use super::{BRICK_VOXELS, Brick, LANES, centred, choose, is_tame, map, mean, sum};
 
 /// How to share.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -83,15 +83,26 @@ struct Features {
 
 /// Finds shapes, and the bricks that can share them. The same for any number of threads.
 pub fn share(bricks: &[Brick], settings: &Settings) -> Shapes {
-    let kept = || Shapes { shapes: Vec::new(), of_brick: vec![None; bricks.len()] };
     // Written so that NaN fails.
     let has_bounds = settings.max_error >= 0.0 && settings.max_mse >= 0.0;
     if !has_bounds || settings.shapes == 0 {
-        return kept();
+        return Shapes { shapes: Vec::new(), of_brick: vec![None; bricks.len()] };
     }
+    let mut shapes = find(bricks, settings);
+    if shapes.is_empty() {
+        // For bricks that are flat within the bounds.
+        shapes.push([0.0; BRICK_VOXELS]);
+    }
+    let matcher = Matcher::new(shapes);
+    let limit = settings.max_mse.min(settings.max_error.powi(2)) * BRICK_VOXELS as f32;
+    let of_brick = assign(bricks, &matcher, settings, limit);
+    drop_lonely(matcher.shapes, of_brick)
+}
+
+/// Finds shapes that many of some bricks can share within the bounds. The same for any number of threads.
+pub fn find(bricks: &[Brick], settings: &Settings) -> Vec<Brick> {
     let basis = Basis::new();
     let features = map(bricks.len(), || (), |(), i| basis.features(&bricks[i]));
-    let limit = settings.max_mse.min(settings.max_error.powi(2)) * BRICK_VOXELS as f32;
     let target = settings.max_mse.min((settings.max_error / PEAK).powi(2)) * BRICK_VOXELS as f32;
 
     // Worth learning from: bricks that are not flat, and that low frequencies can tell within the bounds.
@@ -103,19 +114,96 @@ pub fn share(bricks: &[Brick], settings: &Settings) -> Shapes {
         .collect();
     let sample = choose(&reachable, FIT_SAMPLE, settings.seed);
     let mut spectra = cover(&features, &sample, settings.shapes.min(u32::MAX as usize), target);
+    if spectra.is_empty() {
+        return Vec::new();
+    }
     for _ in 0..settings.iterations {
         spectra = fit_spectra(&features, &sample, spectra, target);
     }
-    let mut shapes = fit_shapes(bricks, &features, &sample, &spectra, target);
-    if shapes.is_empty() {
-        // For bricks that are flat within the bounds.
-        shapes.push([0.0; BRICK_VOXELS]);
+    fit_shapes(bricks, &features, &sample, &spectra, target)
+}
+
+/// Finds the shapes that are the most like a brick.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Matcher {
+    /// The shapes, about zero on average.
+    pub shapes: Vec<Brick>,
+    basis: Basis,
+    /// The sum of squares of each shape.
+    energies: Vec<f32>,
+    /// The low frequencies of shapes as if their energies were one, all shapes of one frequency side by side.
+    table: Vec<f32>,
+}
+
+/// A shape that a brick is like.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Match {
+    /// The index of the shape.
+    pub shape: usize,
+    /// How much of the brick lies along the shape, by the low frequencies: a length, of either sign.
+    along: f32,
+}
+
+impl Matcher {
+    /// Prepares shapes for being compared with.
+    pub fn new(shapes: Vec<Brick>) -> Matcher {
+        let basis = Basis::new();
+        let energies: Vec<f32> = shapes.iter().map(|shape| sum(shape, shape, |a, b| a * b)).collect();
+        let spectra: Vec<Spectrum> = shapes.iter().map(|shape| basis.spectrum(shape)).collect();
+        let length = |i: usize| if energies[i] > 0.0 { energies[i].sqrt() } else { 1.0 };
+        let table = (0..basis.frequencies.len())
+            .flat_map(|f| spectra.iter().enumerate().map(move |(i, spectrum)| spectrum[f] / length(i)))
+            .collect();
+        Matcher { shapes, basis, energies, table }
     }
-    let of_brick = assign(bricks, &features, &basis, &shapes, settings, limit);
-    drop_lonely(shapes, of_brick)
+
+    /// The likeliest shapes of a brick that may leave no more of it than `limit`, the sum of squares over its voxels;
+    /// the best first. `along` is working memory.
+    pub fn likely(
+        &self,
+        brick: &Brick,
+        limit: f32,
+        along: &mut Vec<f32>,
+    ) -> impl Iterator<Item = Match> + use<> {
+        let Features { spectrum, energy } = self.basis.features(brick);
+        along.clear();
+        along.resize(self.shapes.len(), 0.0);
+        let mut likely = [Match::default(); CHECKED];
+        // What a shape leaves of the whole energy: all that it does not describe among the low frequencies, if the rest
+        // fits as well as it can.
+        let rest = (energy - dot(&spectrum, &spectrum)).max(0.0).sqrt();
+        if energy.is_finite() && !self.shapes.is_empty() {
+            for (amplitude, shapes) in spectrum.iter().zip(self.table.chunks_exact(self.shapes.len())) {
+                for (along, shape) in along.iter_mut().zip(shapes) {
+                    *along += amplitude * shape;
+                }
+            }
+            for (shape, along) in along.iter().enumerate() {
+                if along.abs() > likely[CHECKED - 1].along.abs() {
+                    likely[CHECKED - 1] = Match { shape, along: *along };
+                    for place in (1..CHECKED).rev() {
+                        if likely[place].along.abs() > likely[place - 1].along.abs() {
+                            likely.swap(place, place - 1);
+                        }
+                    }
+                }
+            }
+        }
+        let can_fit = move |found: &Match| energy - (found.along.abs() + rest).powi(2) <= limit;
+        likely.into_iter().filter(|found| found.along != 0.0).filter(can_fit)
+    }
+
+    /// A brick in terms of a shape, with the scale and bias of least squares.
+    pub fn fit(&self, brick: &Brick, shape: usize) -> SharedBrick {
+        let (values, mean) = centred(brick);
+        let across = sum(&values, &self.shapes[shape], |a, b| a * b);
+        let scale = if self.energies[shape] > 0.0 { across / self.energies[shape] } else { 0.0 };
+        SharedBrick { shape: shape as u32, scale, bias: mean }
+    }
 }
 
 /// The lowest frequencies of the discrete cosine transform along three axes.
+#[derive(Debug, Clone, PartialEq)]
 struct Basis {
     /// One axis: amplitude by frequency and voxel.
     axis: [[f32; 8]; PER_AXIS],
@@ -322,69 +410,24 @@ fn fit_shapes(
     shapes.into_iter().flatten().collect()
 }
 
-fn assign(
-    bricks: &[Brick],
-    features: &[Features],
-    basis: &Basis,
-    shapes: &[Brick],
-    settings: &Settings,
-    limit: f32,
-) -> Vec<Option<SharedBrick>> {
-    let energies: Vec<f32> = shapes.iter().map(|shape| sum(shape, shape, |a, b| a * b)).collect();
-    // All shapes of one frequency side by side, as if their energy were one.
-    let spectra: Vec<Spectrum> = shapes.iter().map(|shape| basis.spectrum(shape)).collect();
-    let length = |i: usize| if energies[i] > 0.0 { energies[i].sqrt() } else { 1.0 };
-    let table: Vec<f32> = (0..basis.frequencies.len())
-        .flat_map(|f| spectra.iter().enumerate().map(move |(i, spectrum)| spectrum[f] / length(i)))
-        .collect();
-    map(
-        bricks.len(),
-        || vec![0f32; shapes.len()],
-        |along, i| {
-            let Features { spectrum, energy } = &features[i];
-            if !energy.is_finite() {
-                return None;
+fn assign(bricks: &[Brick], matcher: &Matcher, settings: &Settings, limit: f32) -> Vec<Option<SharedBrick>> {
+    map(bricks.len(), Vec::new, |along, i| {
+        let brick = &bricks[i];
+        if !is_tame(brick) {
+            return None;
+        }
+        let likely = matcher.likely(brick, limit, along).map(|found| matcher.fit(brick, found.shape));
+        let flat = SharedBrick { shape: 0, scale: 0.0, bias: mean(brick) };
+        let mut best: Option<(f32, SharedBrick)> = None;
+        for shared in likely.chain([flat]) {
+            if let Some(mse) = error_within(brick, &shared, &matcher.shapes[shared.shape as usize], settings)
+                && best.is_none_or(|(least, _)| mse < least)
+            {
+                best = Some((mse, shared));
             }
-            along.fill(0.0);
-            for (amplitude, shapes) in spectrum.iter().zip(table.chunks_exact(shapes.len())) {
-                for (along, shape) in along.iter_mut().zip(shapes) {
-                    *along += amplitude * shape;
-                }
-            }
-            // The likeliest few, best first.
-            let mut likely = [(0f32, 0usize); CHECKED];
-            for (shape, along) in along.iter().enumerate() {
-                if along.abs() > likely[CHECKED - 1].0 {
-                    likely[CHECKED - 1] = (along.abs(), shape);
-                    for place in (1..CHECKED).rev() {
-                        if likely[place].0 > likely[place - 1].0 {
-                            likely.swap(place, place - 1);
-                        }
-                    }
-                }
-            }
-            // What a shape leaves of the whole energy: all that it does not describe among the low
-            // frequencies, if the rest fits as well as it can.
-            let rest = (energy - dot(spectrum, spectrum)).max(0.0);
-            let can_fit = |along: f32| energy - (along + rest.sqrt()).powi(2) <= limit;
-            let flat = (*energy <= limit).then_some((0.0, 0));
-            let to_check = likely.iter().filter(|(along, _)| *along > 0.0 && can_fit(*along)).chain(&flat);
-            let mut best: Option<(f32, SharedBrick)> = None;
-            let mut own = None;
-            for (along, shape) in to_check {
-                let (values, mean) = own.get_or_insert_with(|| centred(&bricks[i]));
-                let across = sum(values, &shapes[*shape], |a, b| a * b);
-                let scale = if *along > 0.0 { across / energies[*shape] } else { 0.0 };
-                let shared = SharedBrick { shape: *shape as u32, scale, bias: *mean };
-                if let Some(mse) = error_within(&bricks[i], &shared, &shapes[*shape], settings)
-                    && best.is_none_or(|(least, _)| mse < least)
-                {
-                    best = Some((mse, shared));
-                }
-            }
-            best.map(|(_, shared)| shared)
-        },
-    )
+        }
+        best.map(|(_, shared)| shared)
+    })
 }
 
 /// The mean squared error of a brick, if that and the largest are within the bounds.

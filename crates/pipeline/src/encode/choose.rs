@@ -217,6 +217,7 @@ impl Totals {
 #[cfg(test)]
 mod tests {
     use super::super::quantize::{Brick, CODECS, ChannelScale};
+    use super::super::shapes::Shapes;
     use super::*;
 
     const SCALE: ChannelScale = ChannelScale {
@@ -234,12 +235,13 @@ mod tests {
     }
 
     fn curve(brick: &Brick, max_error: Option<f32>, largest: Lambda) -> Curve {
-        Curve::of(&mut Measure::of(brick, &SCALE), &CODECS, max_error, largest)
+        Curve::of(&mut Measure::of(brick, &SCALE, &Shapes::default()), &CODECS, max_error, largest)
     }
 
     /// The least that a brick costs, tried codec by codec.
     fn least(brick: &Brick, max_error: Option<f32>, lambda: Lambda) -> f64 {
-        let mut measure = Measure::of(brick, &SCALE);
+        let shapes = Shapes::default();
+        let mut measure = Measure::of(brick, &SCALE, &shapes);
         let candidates = CODECS.iter().filter_map(|codec| {
             let error =
                 measure.error(*codec).filter(|error| max_error.is_none_or(|bound| error.max <= bound))?;

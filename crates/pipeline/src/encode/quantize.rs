@@ -14,6 +14,7 @@ use nuage_volume::codec::{BrickContext, Codec, Line, codes, interpolate_corners,
 use nuage_volume::space::BRICK_VOXELS;
 
 use super::block;
+use super::shapes::{SHAPE_CODEC, Shapes, Shared};
 
 /// The values of a brick.
 pub type Brick = [f32; BRICK_VOXELS];
@@ -43,9 +44,10 @@ pub struct Error {
 }
 
 /// The codecs that are tried unless one is asked for, the cheapest first.
-pub const CODECS: [Codec; 24] = [
+pub const CODECS: [Codec; 25] = [
     Codec::Constant,
     Codec::Gradient { bits: 0 },
+    Codec::Shared,
     Codec::Uniform { bits: 1 },
     Codec::Gradient { bits: 1 },
     Codec::Split { bits: 1 },
@@ -74,21 +76,23 @@ pub const CODECS: [Codec; 24] = [
 pub struct Measure<'a> {
     values: &'a Brick,
     scale: &'a ChannelScale,
+    shapes: &'a Shapes,
     range: Range,
     /// The fitted gradient and the range of what it leaves over, once a codec has asked for it.
     gradient: Option<(Gradient, Range)>,
 }
 
 impl<'a> Measure<'a> {
-    /// Begins with a brick.
-    pub fn of(values: &'a Brick, scale: &'a ChannelScale) -> Self {
-        Measure { values, scale, range: Range::of_residuals(values, &NOTHING, scale), gradient: None }
+    /// Begins with a brick. `shapes` are those that it may share.
+    pub fn of(values: &'a Brick, scale: &'a ChannelScale, shapes: &'a Shapes) -> Self {
+        let range = Range::of_residuals(values, &NOTHING, scale);
+        Measure { values, scale, shapes, range, gradient: None }
     }
 
-    /// The error in a codec, `None` where it cannot hold the brick: empty voxels would not stay empty, or a sign would
-    /// change. [`Codec::F32`] always can.
+    /// The error in a codec, `None` where it cannot hold the brick: empty voxels would not stay empty, a sign would
+    /// change, or no shape is like it. [`Codec::F32`] always can.
     pub fn error(&mut self, codec: Codec) -> Option<Error> {
-        let Measure { values, scale, range, ref mut gradient } = *self;
+        let Measure { values, scale, shapes, range, ref mut gradient } = *self;
         match codec {
             Codec::Constant => {
                 let line = Line { low: constant(values, scale), step: 0.0 };
@@ -118,14 +122,21 @@ impl<'a> Measure<'a> {
             }
             Codec::Block { .. } => {
                 let mut words = Vec::new();
-                write(values, codec, scale, &mut words);
+                write(values, codec, scale, shapes, &mut words);
                 let mut decoded = [0.0; BRICK_VOXELS];
                 decode(codec, &words, scale, &mut decoded).then(|| error(values, &decoded, scale)).flatten()
             }
             Codec::F32 => Some(Error::default()),
-            Codec::Shared => None,
+            Codec::Shared => best_shared(values, scale, shapes).map(|(error, _)| error),
         }
     }
+}
+
+/// The shape that is the most like a brick, with its error.
+fn best_shared(values: &Brick, scale: &ChannelScale, shapes: &Shapes) -> Option<(Error, Shared)> {
+    let likely = shapes.likely(values, scale).into_iter();
+    let errors = likely.filter_map(|shared| Some((error(values, &shapes.values(&shared), scale)?, shared)));
+    errors.min_by(|(a, _), (b, _)| a.squared.total_cmp(&b.squared))
 }
 
 /// The value that stands for a brick of [`Codec::Constant`]: the background if some of it is empty, so that what is
@@ -139,11 +150,12 @@ pub fn constant(values: &Brick, scale: &ChannelScale) -> f32 {
     (0.5 * min + 0.5 * max).clamp(min, max)
 }
 
-/// Appends the words of a brick in a codec: those that [`measure`] measured.
+/// Appends the words of a brick in a codec: those that [`Measure`] measured. In the place of a shape's offset stands its
+/// index.
 ///
 /// # Panics
-/// If the codec is [`Codec::Shared`], which takes more than the brick's own values.
-pub fn write(values: &Brick, codec: Codec, scale: &ChannelScale, words: &mut Vec<u32>) {
+/// If the codec is [`Codec::Shared`] and no shape is like the brick.
+pub fn write(values: &Brick, codec: Codec, scale: &ChannelScale, shapes: &Shapes, words: &mut Vec<u32>) {
     match codec {
         Codec::Constant => {}
         Codec::Uniform { bits } => {
@@ -178,7 +190,12 @@ pub fn write(values: &Brick, codec: Codec, scale: &ChannelScale, words: &mut Vec
         }
         Codec::Block { .. } => write_block(values, codec, scale, words),
         Codec::F32 => words.extend(values.iter().map(|value| value.to_bits())),
-        Codec::Shared => unreachable!("a shared brick needs a shape"),
+        Codec::Shared => {
+            let Some((_, shared)) = best_shared(values, scale, shapes) else {
+                unreachable!("a brick that was measured has a shape")
+            };
+            words.extend([shared.word, shared.shape as u32, u32::from(SHAPE_CODEC.tag())]);
+        }
     }
 }
 
@@ -583,12 +600,13 @@ mod tests {
             let blocks = blocks.map(|format| Codec::Block { format, axis: PackingAxis::Y });
             let codecs = [&CODECS[..], &blocks].concat();
             prop_assert!(CODECS.is_sorted_by_key(|codec| codec.word_count()));
-            let mut measure = Measure::of(&values, &scale);
+            let shapes = Shapes::default();
+            let mut measure = Measure::of(&values, &scale, &shapes);
             prop_assert!(measure.error(Codec::F32) == Some(Error::default()));
             for codec in codecs {
                 let Some(error) = measure.error(codec) else { continue };
                 let mut words = Vec::new();
-                write(&values, codec, &scale, &mut words);
+                write(&values, codec, &scale, &shapes, &mut words);
                 prop_assert_eq!(words.len(), codec.word_count());
                 let mut decoded = [constant(&values, &scale); BRICK_VOXELS];
                 if codec != Codec::Constant {
@@ -617,7 +635,8 @@ mod tests {
     fn a_linear_ramp_is_its_corners() {
         let values = brick([1.0, 0.5, 0.25], 1.0, 0.0, 0.0, false);
         let scale = scale(0.0);
-        let mut measure = Measure::of(&values, &scale);
+        let shapes = Shapes::default();
+        let mut measure = Measure::of(&values, &scale, &shapes);
         let gradient = measure.error(Codec::Gradient { bits: 0 });
         assert!(gradient.is_some_and(|error| error.max < 0.01), "{gradient:?}");
         assert!(measure.error(Codec::Uniform { bits: 1 }).is_some_and(|error| error.max > 0.2));

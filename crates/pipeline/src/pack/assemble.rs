@@ -5,6 +5,8 @@
 
 use std::collections::HashMap;
 use std::io::{Seek, Write};
+use std::ops::Range;
+use std::sync::Arc;
 
 use glam::IVec3;
 use nuage_volume::brick::BrickSummary;
@@ -15,10 +17,10 @@ use nuage_volume::packed::TreeRef;
 use nuage_volume::packed::build::{EntryScale, Packer, TooLarge};
 use nuage_volume::space::BRICK_VOXELS;
 
-use super::frame::{EncodedFrame, EncodedLevel, Options};
+use super::frame::{EncodedFrame, EncodedGrid, EncodedLevel, Options};
 use super::plan::Plan;
 use crate::each;
-use crate::encode::quantize::ChannelScale;
+use crate::encode::shapes::{SHAPE_CODEC, Shapes};
 
 /// Why a file cannot be put together.
 #[derive(Debug, thiserror::Error)]
@@ -45,6 +47,8 @@ pub struct Report {
     pub tree_bytes: u64,
     /// The bytes of all bricks in memory.
     pub brick_bytes: u64,
+    /// The bytes of all shapes in memory.
+    pub shape_bytes: u64,
     /// The entries of all nodes.
     pub entries: u64,
     /// The bricks of the sources that are not constant, over all frames and channels.
@@ -60,6 +64,10 @@ pub struct Assembler<'c, W: Write + Seek> {
     contents: Contents,
     /// Where each brick stands, by a digest of its codec and words.
     bricks: HashMap<u128, u32>,
+    /// The shapes that bricks have shared so far: where each stands, by channel and index.
+    shapes: HashMap<(usize, u32), u32>,
+    /// The shapes of each channel.
+    channel_shapes: Vec<Arc<Shapes>>,
     stored_words: u64,
     source_bricks: u64,
 }
@@ -97,6 +105,8 @@ impl<'c, W: Write + Seek> Assembler<'c, W> {
             packer: Packer::default(),
             contents: Contents { frame_rate, channels, frames: Vec::new() },
             bricks: HashMap::new(),
+            shapes: HashMap::new(),
+            channel_shapes: plan.channels.iter().map(|channel| Arc::clone(&channel.shapes)).collect(),
             stored_words: 0,
             source_bricks: 0,
         })
@@ -114,7 +124,7 @@ impl<'c, W: Write + Seek> Assembler<'c, W> {
     ) -> Result<(), AssembleError> {
         let mut grids = Vec::with_capacity(frame.grids.len());
         for grid in &frame.grids {
-            let levels = grid.levels.iter().map(|level| self.add_level(level, &grid.scale));
+            let levels = grid.levels.iter().map(|level| self.add_level(level, grid));
             let levels = levels.collect::<Result<_, _>>()?;
             self.source_bricks += grid.source_bricks;
             let quality = &mut self.contents.channels[grid.channel].quality;
@@ -134,17 +144,27 @@ impl<'c, W: Write + Seek> Assembler<'c, W> {
         Ok(())
     }
 
-    fn add_level(&mut self, level: &EncodedLevel, scale: &ChannelScale) -> Result<TreeRef, AssembleError> {
+    fn add_level(&mut self, level: &EncodedLevel, grid: &EncodedGrid) -> Result<TreeRef, AssembleError> {
+        let scale = &grid.scale;
         let background = scale.background;
+        let mut words = level.words.clone();
         let begins = [0].into_iter().chain(level.bricks.iter().map(|(_, _, end)| *end));
-        let bricks: Vec<(IVec3, Codec, &[u32])> = (level.bricks.iter().zip(begins))
-            .map(|((place, codec, end), begin)| (*place, *codec, &level.words[begin..*end]))
+        let ranges = level.bricks.iter().zip(begins).map(|((_, _, end), begin)| begin..*end);
+        let ranges: Vec<Range<usize>> = ranges.collect();
+        for ((_, codec, _), range) in level.bricks.iter().zip(&ranges) {
+            if *codec == Codec::Shared {
+                self.place_shape(grid.channel, &mut words[range.clone()])?;
+            }
+        }
+        let bricks: Vec<(IVec3, Codec, &[u32])> = (level.bricks.iter().zip(ranges))
+            .map(|((place, codec, _), range)| (*place, *codec, &words[range]))
             .collect();
+        let shapes = self.writer.shape_words();
         // Trees know of no background but zero: they are built of what values differ from it.
         let summaries = each(bricks.len(), |i| {
             let (_, codec, words) = bricks[i];
             let mut values = [background; BRICK_VOXELS];
-            let context = BrickContext { words, shapes: &[], unit: scale.unit, floor: scale.floor };
+            let context = BrickContext { words, shapes, unit: scale.unit, floor: scale.floor };
             let decoded = context.decode(codec, 0, &mut values);
             debug_assert!(decoded.is_ok(), "what was encoded decodes");
             values.iter_mut().for_each(|value| *value -= background);
@@ -183,17 +203,35 @@ impl<'c, W: Write + Seek> Assembler<'c, W> {
         Ok(self.packer.add(&tree, &places, scale, constant)?)
     }
 
+    /// Puts the offset of a shape where a brick has its index. A shape stands in the file from when it is first used.
+    fn place_shape(&mut self, channel: usize, brick: &mut [u32]) -> Result<(), AssembleError> {
+        let index = brick[1];
+        let offset = match self.shapes.get(&(channel, index)) {
+            Some(offset) => *offset,
+            None => {
+                let words = &self.channel_shapes[channel].words[index as usize];
+                let offset = self.writer.shape(SHAPE_CODEC, words)?;
+                self.shapes.insert((channel, index), offset);
+                offset
+            }
+        };
+        brick[1] = offset;
+        Ok(())
+    }
+
     /// Ends the file.
     ///
     /// # Errors
     /// If the rest cannot be written.
     pub fn finish(self) -> Result<Report, AssembleError> {
         let trees = self.packer.finish();
+        let shape_bytes = 4 * self.writer.shape_words().len() as u64;
         let summary = self.writer.finish(&self.contents, &trees)?;
         Ok(Report {
             summary,
             tree_bytes: trees.size_bytes() as u64,
             brick_bytes: 4 * self.stored_words,
+            shape_bytes,
             entries: trees.entries.len() as u64,
             source_bricks: self.source_bricks,
             bricks_stored: self.bricks.len() as u64,

@@ -16,6 +16,7 @@ use super::plan::{ChannelPlan, ChannelTree, Plan, channel_trees};
 use crate::each;
 use crate::encode::choose::{Candidate, Curve, Lambda, Target, Totals};
 use crate::encode::quantize::{Brick, CODECS, ChannelScale, Error, Measure, constant, write};
+use crate::encode::shapes::{SAMPLE_BRICKS, Shapes};
 use crate::import::linear_transform;
 
 /// How large an error may be.
@@ -50,6 +51,9 @@ pub struct Options {
     pub codec: Option<Codec>,
     /// How many coarser levels are made at most.
     pub coarser_levels: u32,
+    /// How many shapes the bricks of a channel may share at most. Finding them takes long, and only where large errors are
+    /// allowed do they save much.
+    pub shapes: u32,
 }
 
 impl Default for Options {
@@ -60,6 +64,7 @@ impl Default for Options {
             bits_per_voxel: None,
             codec: None,
             coarser_levels: 0,
+            shapes: 0,
         }
     }
 }
@@ -224,35 +229,38 @@ struct Choice {
     is_forced: bool,
     max_error: Option<f32>,
     lambda: Lambda,
+    shapes: Arc<Shapes>,
 }
 
 impl Choice {
     fn new(planned: &ChannelPlan, options: &Options, lambda: Lambda) -> Choice {
+        let shapes = Arc::clone(&planned.shapes);
         match options.codec {
             // A codec that is asked for is not weighed against others; what it cannot hold takes more.
             Some(codec) => {
                 let codecs = vec![codec, Codec::Uniform { bits: 8 }, Codec::F32];
-                Choice { codecs, is_forced: true, max_error: None, lambda }
+                Choice { codecs, is_forced: true, max_error: None, lambda, shapes }
             }
             None => Choice {
                 codecs: CODECS.to_vec(),
                 is_forced: false,
                 max_error: options.max_error.map(|bound| bound.of(planned.peak())),
                 lambda,
+                shapes,
             },
         }
     }
 
     /// The codecs that are the best for a brick with some λ up to that of the choice.
     fn curve(&self, brick: &Brick, scale: &ChannelScale) -> Curve {
-        Curve::of(&mut Measure::of(brick, scale), &self.codecs, self.max_error, self.lambda)
+        Curve::of(&mut Measure::of(brick, scale, &self.shapes), &self.codecs, self.max_error, self.lambda)
     }
 
     fn best(&self, brick: &Brick, scale: &ChannelScale) -> Candidate {
         if !self.is_forced {
             return self.curve(brick, scale).at(self.lambda);
         }
-        let mut measure = Measure::of(brick, scale);
+        let mut measure = Measure::of(brick, scale, &self.shapes);
         let mut held = self
             .codecs
             .iter()
@@ -282,6 +290,31 @@ fn target(planned: &ChannelPlan, options: &Options) -> Target {
 /// The λ with which a channel meets what is asked of it, from the sums over all its bricks.
 pub fn settle(totals: &Totals, planned: &ChannelPlan, options: &Options) -> Lambda {
     totals.lambda(&target(planned, options))
+}
+
+/// Finds the shapes of each channel, in bricks of some frames of the sequence. A codec that is asked for has none.
+pub fn find_shapes(frames: &[&[Grid]], plan: &mut Plan, options: &Options) {
+    if options.codec.is_some() || options.shapes == 0 {
+        return;
+    }
+    for planned in &mut plan.channels {
+        let trees = frames.iter().flat_map(|grids| channel_trees(grids).0);
+        let levels: Vec<Level> = trees
+            .filter(|tree| tree.key == planned.key)
+            .map(|tree| Level::of(&tree.tree, IVec3::ZERO))
+            .collect();
+        let count: usize = levels.iter().map(|level| level.bricks.len()).sum();
+        let every = count.div_ceil(SAMPLE_BRICKS).max(1);
+        let bricks = levels.iter().flat_map(|level| &level.bricks).step_by(every).copied();
+        let bricks: Vec<Brick> = bricks.collect();
+        let bound = options.max_error.map_or(f32::INFINITY, |bound| bound.of(planned.peak()));
+        // Bricks that are like others may take some times their share of the error, as it saves so much.
+        let share = target(planned, options)
+            .squared_error
+            .map_or(f64::INFINITY, |squared| 4.0 * squared / planned.bricks.max(1) as f64);
+        planned.shapes =
+            Arc::new(Shapes::find(&bricks, options.shapes as usize, &planned.scale(0.0), bound, share));
+    }
 }
 
 /// What each λ leads to in one channel of a frame.
@@ -338,7 +371,7 @@ fn encode_level(
             None => choice.best(brick, scale),
         };
         let mut words = Vec::with_capacity(best.codec.word_count());
-        write(brick, best.codec, scale, &mut words);
+        write(brick, best.codec, scale, &choice.shapes, &mut words);
         (best, words)
     });
     let mut encoded = EncodedLevel { tiles: level.tiles.clone(), ..EncodedLevel::default() };

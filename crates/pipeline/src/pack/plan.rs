@@ -1,6 +1,7 @@
 //! What has to be known of a sequence before its first frame is encoded: its channels, and the range of each.
 
 use std::borrow::Cow;
+use std::sync::Arc;
 
 use nuage_vdb::{AnyTree, Grid, Shape, Tree};
 use nuage_volume::format::Role;
@@ -9,6 +10,7 @@ use nuage_volume::space::BRICK_VOXELS;
 use crate::each;
 use crate::encode::choose::Lambda;
 use crate::encode::quantize::ChannelScale;
+use crate::encode::shapes::Shapes;
 
 /// Values beyond this count as this: twice as much is still a float, and a power of two above it is.
 pub const LARGEST: f32 = 8.507_059e37; // 2¹²⁶
@@ -44,6 +46,8 @@ pub struct ChannelPlan {
     pub bricks: u64,
     /// The weight of errors with which the channel meets what is asked of it.
     pub lambda: Lambda,
+    /// The shapes that bricks may share.
+    pub shapes: Arc<Shapes>,
 }
 
 /// The channels of a sequence, in the order in which they were met.
@@ -93,7 +97,16 @@ impl Plan {
         let (trees, left_out) = channel_trees(grids);
         let channels = trees.into_iter().map(|ChannelTree { key, grid, tree }| {
             let Survey { min, max, voxels, bricks } = survey(&tree);
-            ChannelPlan { key, role: role(&grids[grid]), min, max, voxels, bricks, lambda: Lambda::NONE }
+            ChannelPlan {
+                key,
+                role: role(&grids[grid]),
+                min,
+                max,
+                voxels,
+                bricks,
+                lambda: Lambda::NONE,
+                shapes: Arc::default(),
+            }
         });
         self.merge(Plan { channels: channels.collect(), left_out });
     }

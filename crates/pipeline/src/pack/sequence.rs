@@ -9,7 +9,9 @@ use std::io::{Seek, Write};
 use nuage_vdb::{Grid, Metadata};
 
 use super::assemble::{AssembleError, Assembler, Report};
-use super::frame::{EncodeError, EncodedFrame, Options, WeighedChannel, encode_frame, settle, weigh_frame};
+use super::frame::{
+    EncodeError, EncodedFrame, Options, WeighedChannel, encode_frame, find_shapes, settle, weigh_frame,
+};
 use super::plan::Plan;
 use crate::each;
 use crate::encode::choose::Totals;
@@ -80,13 +82,17 @@ pub fn pack<E: Send, W: Write + Seek>(
             let (found, loaded) = looked?;
             plan.merge(found);
             let bytes: u64 = loaded.0.iter().map(|grid| grid.tree.memory_bytes()).sum();
-            if kept_bytes + bytes <= KEPT_BYTES || frames.len() == 1 {
+            if kept_bytes == 0 || kept_bytes + bytes <= KEPT_BYTES {
                 kept_bytes += bytes;
                 kept[frame].loaded = Some(loaded);
             }
         }
         tell(window.len());
     }
+    // Shapes are found in what is at hand: all frames, or the first of a long sequence.
+    let samples: Vec<&[Grid]> =
+        kept.iter().filter_map(|kept| Some(kept.loaded.as_ref()?.0.as_slice())).collect();
+    find_shapes(&samples, &mut plan, options);
     if is_weighed {
         let mut sums: Vec<Totals> = plan.channels.iter().map(|_| Totals::default()).collect();
         for window in windows(frames.len()) {

@@ -18,6 +18,7 @@ use super::layout::{Layout, TextureFormat};
 use crate::each;
 use crate::encode::block::{self, Quality};
 use crate::encode::quantize::{self, Brick, ChannelScale};
+use crate::encode::shapes::Shapes;
 use crate::pack::plan::BACKGROUND_TOLERANCE;
 
 /// What is asked of a texture.
@@ -323,7 +324,7 @@ impl Encoder<'_> {
                     keeps_sign: false,
                 };
                 let mut words = Vec::with_capacity(wanted.word_count());
-                quantize::write(&decode()?, wanted, &scale, &mut words);
+                quantize::write(&decode()?, wanted, &scale, &Shapes::default(), &mut words);
                 self.of_words(&words)
             }
         }

@@ -80,6 +80,11 @@ impl<'a, W: Write + Seek> Writer<'a, W> {
         self.store.push_shape(codec, words).map_err(misuse)
     }
 
+    /// The words of all shapes that were added, from which their offsets count.
+    pub fn shape_words(&self) -> &[u32] {
+        self.store.shape_words()
+    }
+
     /// Writes the last page, and makes it absent.
     fn write_page(&mut self) -> Result<(), FormatError> {
         let Some(page) = self.store.pages().get(self.written_pages) else { return Ok(()) };
