@@ -53,16 +53,31 @@ fn unpack_bits<const BITS: usize>(
 /// # Panics
 /// If `bits` is not 1 to 8.
 pub fn pack(bits: u8, codes: &[u8; BRICK_VOXELS], words: &mut Vec<u32>) {
-    assert!((1..=8).contains(&bits), "{bits} bits");
-    let (mut pending, mut count) = (0_u64, 0);
-    for code in codes {
-        pending |= (u64::from(*code) & ((1 << bits) - 1)) << count;
-        count += u32::from(bits);
-        if count >= 32 {
-            words.push(pending as u32);
-            pending >>= 32;
-            count -= 32;
+    match bits {
+        1 => pack_bits::<1>(codes, words),
+        2 => pack_bits::<2>(codes, words),
+        3 => pack_bits::<3>(codes, words),
+        4 => pack_bits::<4>(codes, words),
+        5 => pack_bits::<5>(codes, words),
+        6 => pack_bits::<6>(codes, words),
+        7 => pack_bits::<7>(codes, words),
+        8 => pack_bits::<8>(codes, words),
+        _ => panic!("{bits} bits"),
+    }
+}
+
+fn pack_bits<const BITS: usize>(codes: &[u8; BRICK_VOXELS], words: &mut Vec<u32>) {
+    for codes in codes.as_chunks::<32>().0 {
+        let mut group = [0_u32; BITS];
+        for (i, code) in codes.iter().enumerate() {
+            let (word, shift) = (i * BITS / 32, i * BITS % 32);
+            let code = u64::from(*code) & ((1 << BITS) - 1);
+            group[word] |= (code << shift) as u32;
+            if shift + BITS > 32 {
+                group[word + 1] |= (code >> (32 - shift)) as u32;
+            }
         }
+        words.extend(group);
     }
 }
 
