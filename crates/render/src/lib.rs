@@ -2,7 +2,8 @@
 //!
 //! [`scene`] says what is rendered and [`camera`] from where; [`traverse`] walks rays through the packed tree;
 //! [`blocks`] keeps
-//! decoded bricks; [`march`] integrates light along them; [`picture`] runs that over all pixels; [`framing`] finds views and
+//! decoded bricks; [`march`] integrates light along them; [`path`] follows it through any number of scatterings;
+//! [`picture`] runs both over all pixels; [`framing`] finds views and
 //! densities for volumes that nobody described; [`film`] and [`output`] hold and encode pictures. Physics in
 //! small functions: [`phase`], [`color`], [`math`], [`hash`].
 //!
@@ -21,6 +22,7 @@ pub mod hash;
 pub mod march;
 pub mod math;
 pub mod output;
+pub mod path;
 pub mod phase;
 pub mod picture;
 pub mod scene;

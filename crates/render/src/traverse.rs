@@ -76,6 +76,19 @@ pub enum RunKind {
     Varying,
 }
 
+/// A stretch of a ray through one region, with bounds of all that can be sampled there.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Segment {
+    /// Where it begins.
+    pub t0: f32,
+    /// Where it ends.
+    pub t1: f32,
+    /// No sample is less.
+    pub min: f32,
+    /// No sample is more; above 0.
+    pub max: f32,
+}
+
 impl<'a> Field<'a> {
     /// Makes a channel ready. `None` if it has no active voxel or is zero everywhere.
     pub fn new(channel: &'a Channel) -> Option<Self> {
@@ -254,6 +267,29 @@ pub struct Runs<'r, 'a> {
 }
 
 impl Runs<'_, '_> {
+    /// The next region that is not empty, brick by brick and not joined as those of the iterator are. To be used
+    /// instead of the iterator.
+    #[inline]
+    pub fn next_segment(&mut self) -> Option<Segment> {
+        while self.t < self.t_end {
+            let (log2_bricks, footprint) = self.accessor.footprint(self.brick);
+            let t0 = self.t;
+            if log2_bricks == 0 {
+                self.step_brick();
+            } else {
+                self.leap(log2_bricks);
+            }
+            let t1 = self.t.min(self.t_end);
+            if footprint.max > 0.0 && t0 < t1 {
+                return Some(Segment { t0, t1, min: footprint.min, max: footprint.max });
+            }
+            if footprint.max <= 0.0 && log2_bricks == LOG2_NODE5_BRICKS {
+                self.leap_to_root_entry();
+            }
+        }
+        None
+    }
+
     /// Moves on to the next brick.
     #[inline]
     fn step_brick(&mut self) {

@@ -4,6 +4,7 @@
 #![allow(clippy::print_stdout, reason = "the measured errors are worth reading")]
 
 mod common;
+mod reference;
 
 use std::f64::consts::PI;
 use std::time::Instant;
@@ -13,44 +14,13 @@ use glam::{DVec2, DVec3, Vec3};
 use nuage_render::camera::{Camera, Ray};
 use nuage_render::march::{Marcher, Quality};
 use nuage_render::picture::render;
-use nuage_render::scene::{Emission, Medium, Scene, Spectrum, Sun};
+use nuage_render::scene::{Emission, Spectrum, Sun};
 use nuage_testkit::npy::{read_f32, read_raw_f64};
-use nuage_volume::channel::Channel;
-use serde_json::Value;
+use reference::{SIZE, camera, channel, json, lit_scene, numbers, path};
 
-const SIZE: u32 = 128;
 const STEPS: [f32; 5] = [4.0, 2.0, 1.0, 0.5, 0.25];
 /// What single precision and the end of rays at a transmittance of 1e-4 leave of the errors at any step.
 const FLOOR: f64 = 2e-5;
-
-fn path(name: &str) -> std::path::PathBuf {
-    nuage_testkit::find(&format!("oracle/{name}")).expect("a committed file")
-}
-
-fn json() -> Value {
-    serde_json::from_slice(&std::fs::read(path("oracle.json")).expect("readable")).expect("JSON")
-}
-
-fn numbers<const N: usize>(value: &Value) -> [f64; N] {
-    std::array::from_fn(|i| value[i].as_f64().expect("a number"))
-}
-
-fn colour(value: &Value) -> [f32; 3] {
-    numbers(value).map(|v| v as f32)
-}
-
-fn camera(json: &Value) -> Camera {
-    let vector = |name: &str| DVec3::from_array(numbers(&json["camera"][name]));
-    let fov = json["camera"]["fov_deg"].as_f64().expect("a number");
-    Camera::look_at(vector("origin"), vector("target"), vector("up"), fov).expect("a view")
-}
-
-fn channel(name: &str) -> Channel {
-    let bytes = std::fs::read(path("oracle_64.vdb")).expect("readable");
-    let file = nuage_vdb::File::open(bytes).expect("a VDB file");
-    let grid = file.read_grid(file.find(name).expect("the grid")).expect("an intact grid");
-    nuage_pipeline::import::import(grid).expect("a linear transform").0
-}
 
 fn pixel_centres(camera: &Camera) -> impl Iterator<Item = Ray> {
     let centre = |i| DVec2::new(f64::from(i % SIZE) + 0.5, f64::from(i / SIZE) + 0.5);
@@ -169,21 +139,6 @@ fn emission_follows_the_quadrature() {
 }
 
 /// The scene of the oracle with sun and sky.
-fn lit_scene<'a>(json: &Value, density: &'a Channel, phase_g: f32) -> Scene<'a> {
-    let scene = &json["scenes"]["het64_g0_ss"];
-    let travel = DVec3::from_array(numbers(&scene["sun_direction_of_travel"]));
-    let medium = Medium {
-        density,
-        density_scale: scene["sigma_scale"].as_f64().expect("a number") as f32,
-        albedo: colour(&scene["albedo"]),
-        phase_g,
-        emission: None,
-    };
-    let irradiance = colour(&scene["sun_irradiance"]);
-    let sun = Some(Sun { direction_to: (-travel).normalize().as_vec3(), irradiance });
-    Scene { camera: camera(json), medium, sun, sky: colour(&scene["sky_radiance"]) }
-}
-
 #[test]
 fn single_scattering_follows_another_renderer() {
     let (json, density) = (json(), channel("density"));

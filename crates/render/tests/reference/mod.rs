@@ -1,0 +1,54 @@
+//! The scenes with known answers: their camera, grids and lights.
+
+use glam::DVec3;
+use nuage_render::camera::Camera;
+use nuage_render::scene::{Medium, Scene, Sun};
+use nuage_volume::channel::Channel;
+use serde_json::Value;
+
+/// Pixels per side of every reference picture.
+pub(crate) const SIZE: u32 = 128;
+
+pub(crate) fn path(name: &str) -> std::path::PathBuf {
+    nuage_testkit::find(&format!("oracle/{name}")).expect("a committed file")
+}
+
+pub(crate) fn json() -> Value {
+    serde_json::from_slice(&std::fs::read(path("oracle.json")).expect("readable")).expect("JSON")
+}
+
+pub(crate) fn numbers<const N: usize>(value: &Value) -> [f64; N] {
+    std::array::from_fn(|i| value[i].as_f64().expect("a number"))
+}
+
+pub(crate) fn colour(value: &Value) -> [f32; 3] {
+    numbers(value).map(|v| v as f32)
+}
+
+pub(crate) fn camera(json: &Value) -> Camera {
+    let vector = |name: &str| DVec3::from_array(numbers(&json["camera"][name]));
+    let fov = json["camera"]["fov_deg"].as_f64().expect("a number");
+    Camera::look_at(vector("origin"), vector("target"), vector("up"), fov).expect("a view")
+}
+
+pub(crate) fn channel(name: &str) -> Channel {
+    let bytes = std::fs::read(path("oracle_64.vdb")).expect("readable");
+    let file = nuage_vdb::File::open(bytes).expect("a VDB file");
+    let grid = file.read_grid(file.find(name).expect("the grid")).expect("an intact grid");
+    nuage_pipeline::import::import(grid).expect("a linear transform").0
+}
+
+pub(crate) fn lit_scene<'a>(json: &Value, density: &'a Channel, phase_g: f32) -> Scene<'a> {
+    let scene = &json["scenes"]["het64_g0_ss"];
+    let travel = DVec3::from_array(numbers(&scene["sun_direction_of_travel"]));
+    let medium = Medium {
+        density,
+        density_scale: scene["sigma_scale"].as_f64().expect("a number") as f32,
+        albedo: colour(&scene["albedo"]),
+        phase_g,
+        emission: None,
+    };
+    let irradiance = colour(&scene["sun_irradiance"]);
+    let sun = Some(Sun { direction_to: (-travel).normalize().as_vec3(), irradiance });
+    Scene { camera: camera(json), medium, sun, sky: colour(&scene["sky_radiance"]) }
+}
