@@ -6,6 +6,16 @@ use crate::values::{
     Auto, Background, Size, SunPosition, albedo, field_of_view, finite, phase, positive, rgb, vec3,
 };
 
+/// How light is followed through the medium.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, clap::ValueEnum)]
+pub(crate) enum Integrator {
+    /// Steps along rays, light scattered once.
+    #[default]
+    March,
+    /// Paths, light scattered any number of times.
+    Path,
+}
+
 /// View, light, medium and quality.
 #[derive(clap::Args, Clone)]
 pub(crate) struct Look {
@@ -103,7 +113,16 @@ pub(crate) struct Look {
     #[arg(long, default_value = "0.05", value_parser = not_negative, value_name = "PART", help_heading = "Quality")]
     pub(crate) shadow_growth: f32,
 
-    /// Camera rays per pixel
+    /// How light is followed: march (scattered once, smooth, with steps) or path (any number of times, unbiased, with
+    /// noise; takes --samples of 16 and more)
+    #[arg(long, value_enum, default_value_t, value_name = "NAME", help_heading = "Quality")]
+    pub(crate) integrator: Integrator,
+
+    /// The most that light scatters with --integrator path [default: as often as it does]
+    #[arg(long, value_parser = clap::value_parser!(u32).range(0..=1_000_000), value_name = "N", help_heading = "Quality")]
+    pub(crate) scatterings: Option<u32>,
+
+    /// Camera rays per pixel; with --integrator path, as many paths
     #[arg(long, default_value = "1", value_parser = clap::value_parser!(u32).range(1..=65536), value_name = "N", help_heading = "Quality")]
     pub(crate) samples: u32,
 

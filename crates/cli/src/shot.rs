@@ -11,14 +11,15 @@ use nuage_render::color::Blackbody;
 use nuage_render::film::{Image, ImageSizeError};
 use nuage_render::framing::{self, WorldBox};
 use nuage_render::march::Quality;
+use nuage_render::path::PathSettings;
 use nuage_render::picture;
 use nuage_render::scene::{Emission, Medium, Scene, Spectrum, Sun};
 use nuage_vdb::{File, Source};
 use nuage_volume::channel::Channel;
 
 use crate::error::explain;
-use crate::look::Look;
-use crate::values::{Auto, Background};
+use crate::look::{Integrator, Look};
+use crate::values::{Auto, Background, Size};
 
 /// The temperature at which a black body has the stated luminance.
 const REFERENCE_KELVIN: f32 = 1500.0;
@@ -202,7 +203,14 @@ impl<'l> Shot<'l> {
             sky_rays: look.sky_rays,
             samples: look.samples,
         };
-        let image = picture::render(&scene, quality, look.size.width, look.size.height, progress)?;
+        let Size { width, height } = look.size;
+        let image = match look.integrator {
+            Integrator::March => picture::render(&scene, quality, width, height, progress)?,
+            Integrator::Path => {
+                let settings = PathSettings { max_scatterings: look.scatterings, ..PathSettings::default() };
+                picture::trace(&scene, settings, look.samples, 0, [width, height], progress)?.image
+            }
+        };
         let image = match look.background {
             Background::None => image,
             Background::Sky => image.over(look.sky),
