@@ -48,7 +48,7 @@ enum Command {
     Probe(probe::Args),
     Render(Box<render::Args>),
     Demo(demo::Args),
-    Diff(diff::Args),
+    Diff(Box<diff::Args>),
     Validate(validate::Args),
     Convert(convert::Args),
     Texture(texture::Args),
