@@ -31,7 +31,7 @@ use crate::values::Auto;
 /// equals voxels of the same value. Values of different types are compared as numbers. Mean, RMS and PSNR are taken over
 /// the voxels of A that differ from its background; PSNR is 10·log10(peak²/MSE), the peak the largest absolute value of
 /// A over all frames. The largest error is that over all voxels, fog that where A is background. Lines marked (note) do
-/// not count: how values are saved, the kind of a transform that does the same, and metadata that writers note anew
+/// not count and are left out of sequences: how values are saved, the kind of a transform that does the same, and metadata that writers note anew
 /// (file_*). Exit codes: 0 equal, 1 different or not readable.
 #[derive(clap::Args)]
 pub(crate) struct Args {
@@ -196,7 +196,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         writeln!(out, "{object}")?;
     } else {
         match (is_sequence, compared.as_slice()) {
-            (false, [files]) => report::print_files(&mut out, files, args)?,
+            (false, [files]) => report::print_files(&mut out, files, args, true)?,
             _ => report::print_sequence(&mut out, &frames, &compared, &totals, args)?,
         }
         if let Some(picture) = picture {

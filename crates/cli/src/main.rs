@@ -24,6 +24,7 @@ mod text;
 mod texture;
 mod validate;
 mod values;
+mod verify;
 
 use std::process::ExitCode;
 

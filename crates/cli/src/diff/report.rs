@@ -11,18 +11,24 @@ use crate::text::{number, one_line, thousands};
 
 const AXES: [&str; 3] = ["x", "y", "z"];
 
-/// Prints how two files differ.
-pub(super) fn print_files(out: &mut impl Write, files: &ComparedFiles, args: &Args) -> io::Result<()> {
+/// Prints how two files differ, with notes of what does not count if `with_notes` is set.
+pub(super) fn print_files(
+    out: &mut impl Write,
+    files: &ComparedFiles,
+    args: &Args,
+    with_notes: bool,
+) -> io::Result<()> {
     for (side, names) in ["A", "B"].iter().zip(&files.only) {
         for name in names {
             writeln!(out, "{}: only in {side}", one_line(name))?;
         }
     }
-    if !files.of_files.is_empty() {
+    let counts = |d: &Disagreement| d.counts && !args.values_only;
+    if files.of_files.iter().any(|d| with_notes || counts(d)) {
         writeln!(out, "the files:")?;
-        print_disagreements(out, &files.of_files, args)?;
+        print_disagreements(out, &files.of_files, args, with_notes)?;
     }
-    files.grids.iter().try_for_each(|grid| print_grid(out, grid, args))
+    files.grids.iter().try_for_each(|grid| print_grid(out, grid, args, with_notes))
 }
 
 /// Prints how two sequences differ, frame by frame and then on the whole.
@@ -39,7 +45,7 @@ pub(super) fn print_sequence(
             true => writeln!(out, "frame {number}: equal")?,
             false => {
                 writeln!(out, "frame {number}: different")?;
-                print_files(out, files, args)?;
+                print_files(out, files, args, false)?;
             }
         }
     }
@@ -59,11 +65,11 @@ pub(super) fn print_sequence(
     Ok(())
 }
 
-fn print_grid(out: &mut impl Write, compared: &Compared, args: &Args) -> io::Result<()> {
+fn print_grid(out: &mut impl Write, compared: &Compared, args: &Args, with_notes: bool) -> io::Result<()> {
     let Compared { name, difference, .. } = compared;
     let verdict = if compared.equal { "equal" } else { "different" };
     writeln!(out, "{}: {verdict}", one_line(name))?;
-    print_disagreements(out, &difference.disagreements, args)?;
+    print_disagreements(out, &difference.disagreements, args, with_notes)?;
     let Some(found) = &difference.voxels else {
         return writeln!(
             out,
@@ -72,7 +78,7 @@ fn print_grid(out: &mut impl Write, compared: &Compared, args: &Args) -> io::Res
     };
     print_counts(out, found, args)?;
     print_errors(out, found, compared.components, compared.is_level_set, "")?;
-    if found.nodes_only_in_a + found.nodes_only_in_b > 0 {
+    if with_notes && found.nodes_only_in_a + found.nodes_only_in_b > 0 {
         let [a, b] = [found.nodes_only_in_a, found.nodes_only_in_b].map(thousands);
         writeln!(out, "  (note) topology: {a} nodes and leaves only in A, {b} only in B")?;
     }
@@ -144,9 +150,18 @@ fn print_errors(
     Ok(())
 }
 
-fn print_disagreements(out: &mut impl Write, disagreements: &[Disagreement], args: &Args) -> io::Result<()> {
+fn print_disagreements(
+    out: &mut impl Write,
+    disagreements: &[Disagreement],
+    args: &Args,
+    with_notes: bool,
+) -> io::Result<()> {
     for Disagreement { what, a, b, counts } in disagreements {
-        let mark = if *counts && !args.values_only { "" } else { "(note) " };
+        let counts = *counts && !args.values_only;
+        if !counts && !with_notes {
+            continue;
+        }
+        let mark = if counts { "" } else { "(note) " };
         let [a, b] = [a, b].map(|side| one_line(side.as_deref().unwrap_or("nothing")));
         writeln!(out, "  {mark}{}: {a} | {b}", one_line(what))?;
     }

@@ -11,57 +11,13 @@ use nuage_volume::build::TileSize;
 use nuage_volume::codec::Codec;
 use nuage_volume::format::Quality;
 
+pub use super::options::{Bound, Options};
+
 use super::level::{Level, Tile};
 use super::plan::{ChannelPlan, ChannelTree, Plan, channel_trees};
 use crate::encode::choose::{Lambda, Target, Totals, choose};
 use crate::encode::quantize::{CODECS, ChannelScale, constant, measure, write};
 use crate::import::linear_transform;
-
-/// How large an error may be.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Bound {
-    /// In the channel's own numbers.
-    Absolute(f32),
-    /// As a part of the channel's peak over all frames.
-    OfPeak(f32),
-}
-
-impl Bound {
-    /// The error in the numbers of a channel with this peak.
-    pub fn of(self, peak: f32) -> f32 {
-        match self {
-            Bound::Absolute(error) => error,
-            Bound::OfPeak(part) => part * peak,
-        }
-    }
-}
-
-/// What is asked of a packed volume.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Options {
-    /// The largest error of any voxel.
-    pub max_error: Option<Bound>,
-    /// The least ratio of a channel's peak to its error over all frames, in dB.
-    pub psnr: Option<f64>,
-    /// The most bits per voxel of bricks that are not constant, over all frames, entries included.
-    pub bits_per_voxel: Option<f64>,
-    /// One codec for all bricks that it can hold, whatever the error.
-    pub codec: Option<Codec>,
-    /// How many coarser levels are made at most.
-    pub coarser_levels: u32,
-}
-
-impl Default for Options {
-    fn default() -> Self {
-        Options {
-            max_error: Some(Bound::OfPeak(0.03)),
-            psnr: Some(45.0),
-            bits_per_voxel: None,
-            codec: None,
-            coarser_levels: 0,
-        }
-    }
-}
 
 /// A frame that is encoded.
 #[derive(Debug, Clone, Default)]
@@ -219,6 +175,7 @@ struct Choice {
 
 impl Choice {
     fn new(planned: &ChannelPlan, options: &Options) -> Choice {
+        let options = options.for_channel(&planned.key.grid);
         match options.codec {
             // A codec that is asked for is not weighed against others; what it cannot hold takes more.
             Some(codec) => {
@@ -250,7 +207,7 @@ pub struct ChannelTotals {
 
 /// The words that the tree takes for a brick: an entry of two, and its part of nodes, masks and entries that are no
 /// bricks.
-const ENTRY_WORDS: f64 = 3.0;
+pub(super) const ENTRY_WORDS: f64 = 3.0;
 
 impl ChannelTotals {
     /// Adds what another frame has.
@@ -262,6 +219,7 @@ impl ChannelTotals {
 
     /// The weight with which the channel meets what is asked of it.
     pub fn lambda(&self, planned: &ChannelPlan, options: &Options) -> Lambda {
+        let options = options.for_channel(&planned.key.grid);
         let peak = f64::from(planned.peak());
         let target = Target {
             squared_error: options

@@ -2,7 +2,7 @@
 //!
 //! Packing goes through a sequence twice. [`plan`] notes the range of each channel over all frames; then [`frame`]
 //! encodes each frame on its own, and [`assemble`] puts frames one after the other into a file, where what they have in
-//! common stands once; [`sequence`] does both. [`level`] makes the coarser levels of a tree, [`unpack`] makes grids of a packed frame again.
+//! common stands once; [`sequence`] does both. [`options`] is what is asked of it, [`level`] makes the coarser levels of a tree, [`unpack`] makes grids of a packed frame again.
 //!
 //! A grid becomes a channel, a vector grid three. Values keep their meaning: a level set stays one. What does not
 //! fit (points, strings, trees of other shapes) is named in a warning and left out. Which codec a brick gets is
@@ -11,6 +11,7 @@
 pub mod assemble;
 pub mod frame;
 pub mod level;
+pub mod options;
 pub mod plan;
 pub mod sequence;
 pub mod unpack;

@@ -10,7 +10,8 @@ use std::io::{Seek, Write};
 use nuage_vdb::{Grid, Metadata};
 
 use super::assemble::{AssembleError, Assembler, Report};
-use super::frame::{ChannelTotals, EncodeError, EncodedFrame, Options, encode_frame, frame_totals};
+use super::frame::{ChannelTotals, EncodeError, EncodedFrame, encode_frame, frame_totals};
+use super::options::{NoSuchChannel, Options};
 use super::plan::Plan;
 use crate::encode::choose::Lambda;
 
@@ -32,6 +33,9 @@ pub enum PackError<E> {
     /// A frame cannot be loaded.
     #[error("{0}")]
     Load(E),
+    /// Something is asked of a channel that is in no frame.
+    #[error(transparent)]
+    Channel(#[from] NoSuchChannel),
     /// A frame cannot be encoded.
     #[error(transparent)]
     Encode(#[from] EncodeError),
@@ -44,7 +48,7 @@ pub enum PackError<E> {
 /// any of the passes, as a part of the whole.
 ///
 /// # Errors
-/// If a frame cannot be loaded or encoded, or the file not written.
+/// If a frame cannot be loaded or encoded, a channel that is asked for by name is in none, or the file cannot be written.
 pub fn pack<E: Send, W: Write + Seek>(
     frames: &[FrameName],
     load: impl Fn(usize) -> Result<Loaded, E> + Sync,
@@ -62,7 +66,7 @@ pub fn pack<E: Send, W: Write + Seek>(
         Some(kept) => Ok(Cow::Borrowed(kept)),
         None => load(frame).map(Cow::Owned).map_err(PackError::Load),
     };
-    let is_weighed = options.codec.is_none() && (options.psnr.is_some() || options.bits_per_voxel.is_some());
+    let is_weighed = options.is_weighed();
     let passes = if is_weighed { 3 } else { 2 };
     let mut finished = 0;
     let mut tell = |count: usize| {
@@ -80,6 +84,7 @@ pub fn pack<E: Send, W: Write + Seek>(
         looked.into_iter().try_for_each(|found| found.map(|found| plan.merge(found)))?;
         tell(window.len());
     }
+    options.apply(&mut plan)?;
     if is_weighed {
         let mut sums: Vec<Option<ChannelTotals>> = vec![None; plan.channels.len()];
         for window in windows(frames.len()) {
