@@ -51,7 +51,7 @@ enum Command {
     Demo(demo::Args),
     Diff(Box<diff::Args>),
     Validate(validate::Args),
-    Convert(convert::Args),
+    Convert(Box<convert::Args>),
     Texture(texture::Args),
 }
 

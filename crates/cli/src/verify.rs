@@ -142,14 +142,14 @@ impl Found {
         let place = errors.max_at.map_or(String::new(), |ijk| format!(" at {ijk:?}"));
         let slack = peak * if self.is_half { f64::from(f16::EPSILON) } else { MAX_ROUNDING };
         let reported = f64::from(quality.max_error);
-        if !((errors.max - reported).abs() <= slack) {
+        if (errors.max - reported).abs() > slack {
             let [found, reported] = [errors.max, reported].map(number);
             return Err(format!("the largest error is {found}{place}, and {reported} is reported"));
         }
         let squared = errors.squares + errors.background_squares;
         let slack_squared =
             SQUARED_ROUNDING * squared.max(quality.squared_error) + f64::from(f32::MIN_POSITIVE);
-        if !self.is_half && !((squared - quality.squared_error).abs() <= slack_squared) {
+        if !self.is_half && (squared - quality.squared_error).abs() > slack_squared {
             let [found, reported] = [squared, quality.squared_error].map(number);
             return Err(format!("the squared errors sum up to {found}, and {reported} is reported"));
         }
