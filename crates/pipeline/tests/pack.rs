@@ -857,7 +857,7 @@ fn what_cannot_be_met_is_known() {
         unmet(&packed(&frames, options).report, options).into_iter().map(|unmet| unmet.what).collect()
     };
     let bound = Some(Bound::OfPeak(1e-4));
-    assert_eq!(missed(&Options { bits_per_voxel: Some(20.0), max_error: bound, ..NOTHING }), []);
+    assert_eq!(missed(&Options { bits_per_voxel: Some(33.0), max_error: bound, ..NOTHING }), []);
     assert_eq!(
         missed(&Options { bits_per_voxel: Some(2.0), max_error: bound, ..NOTHING }),
         [Asked::BitsPerVoxel]
