@@ -7,8 +7,8 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use nuage_pipeline::output::write_whole;
-use nuage_pipeline::pack::frame::{Bound, Options};
+use nuage_pipeline::output::{OutputError, write_whole_with};
+use nuage_pipeline::pack::options::{Bound, Options};
 use nuage_pipeline::sequence::{FrameFile, output_path};
 use nuage_vdb::{AnyFile, AnyTree, Compression, Grid, IndexBox, Metadata, WriteOptions, nano};
 use nuage_volume::codec::Codec;
@@ -16,9 +16,10 @@ use nuage_volume::codec::block::{BlockFormat, PackingAxis};
 
 use crate::error::{Failure, explain};
 use crate::frames;
-use crate::pack::{self, PackArgs};
+use crate::pack::{self, Asked, PackArgs};
 use crate::source::{DiskFile, Memory};
 use crate::text::{number, one_line, thousands};
+use crate::verify;
 
 /// Write grids of VDB and NanoVDB files to another file, chosen, renamed, cut or compressed otherwise; or a whole
 /// sequence to one packed file, and back.
@@ -26,6 +27,9 @@ use crate::text::{number, one_line, thousands};
 /// The name of the output says what it is: .vdb, .nvdb or .nuage. Of several inputs the grids are put together in order;
 /// a sequence, written smoke.####.vdb, smoke.%04d.vdb or as a glob in quotes, becomes one .nuage file, or files with
 /// names of the same kind. An output appears whole or not at all.
+///
+/// --max-error, --psnr, --bits-per-voxel and --codec take NAME=VALUE for one grid of a .nuage file and may be repeated, as
+/// in --max-error temperature=1% --psnr density=50. What is asked of a grid by name replaces what is asked of all.
 #[derive(clap::Args)]
 pub(crate) struct Args {
     /// The files to read, and last the file to write
@@ -77,18 +81,25 @@ pub(crate) struct Args {
 
     /// The largest error of any voxel, in .nuage files and with --encoding fpn: a number, or for .nuage files a
     /// part of a channel's peak, as in 3%
-    #[arg(long, value_name = "X", required_if_eq("encoding", "fpn"), value_parser = pack::bound)]
-    max_error: Option<Bound>,
+    #[arg(
+        long, value_name = "[NAME=]X", required_if_eq("encoding", "fpn"),
+        value_parser = |text: &str| pack::asked(text, pack::bound)
+    )]
+    max_error: Vec<Asked<Bound>>,
 
     /// How .nvdb files are compressed: none, zip or blosc [default: none]; the codec of all bricks in .nuage files that
     /// it can hold: u1 to u8 (uniform codes of so many bits), s1 to s8 (the same by
     /// octants), g0 to g8 (the same around a gradient), f16, f32, or the
     /// texture blocks bc3, bc4 and bc7
-    #[arg(long, value_name = "CODEC", value_parser = codec)]
-    codec: Option<CodecChoice>,
+    #[arg(long, value_name = "[NAME=]CODEC", value_parser = |text: &str| pack::asked(text, codec))]
+    codec: Vec<Asked<CodecChoice>>,
 
     #[command(flatten)]
     pub(crate) pack: PackArgs,
+
+    /// Read the written file again, decode all of it and compare it with the sources, read anew, before it gets its name
+    #[arg(long)]
+    pub(crate) verify: bool,
 
     /// Replace outputs that are there
     #[arg(long)]
@@ -218,42 +229,63 @@ fn not_found(name: &str, names: &[impl std::borrow::Borrow<str>]) -> String {
     format!("grid '{name}' not found; there are: {}", names.join(", "))
 }
 
-/// Converts files to one.
-fn convert(args: &Args, inputs: &[PathBuf], output: &PathBuf, target: &Target) -> Result<(), Failure> {
-    let start = Instant::now();
-    if !args.split {
-        check_absent(output, args.force)?;
-    }
-    let mut grids = Vec::new();
-    let mut metadata = Metadata::default();
-    let mut input_bytes = 0;
+/// The grids of some files put together, with the metadata of all.
+struct Gathered {
+    grids: Vec<Grid>,
+    metadata: Metadata,
+    bytes: u64,
+}
+
+/// Reads the grids of some files that were asked for.
+fn gather(args: &Args, inputs: &[PathBuf]) -> Result<Gathered, Failure> {
+    let mut gathered = Gathered { grids: Vec::new(), metadata: Metadata::default(), bytes: 0 };
     let mut names = Vec::new();
     let mut missing: Vec<&String> = args.grid.iter().chain(args.rename.iter().map(|(old, _)| old)).collect();
     for path in inputs {
         let disk = DiskFile::open(path)?;
         let file = disk.any(args.memory)?;
-        input_bytes += disk.size();
+        gathered.bytes += disk.size();
         for (name, value) in file.metadata().iter() {
-            if metadata.get(name).is_none() {
-                metadata.insert(name, value.clone());
+            if gathered.metadata.get(name).is_none() {
+                gathered.metadata.insert(name, value.clone());
             }
         }
         missing = missing.iter().filter(|name| file.find(name).is_none()).copied().collect();
         names.extend(file.names().into_iter().map(str::to_owned));
-        read(&disk, &file, args, &mut grids)?;
+        read(&disk, &file, args, &mut gathered.grids)?;
     }
-    if let Some(name) = missing.first() {
-        return Err(Failure::file(inputs.first().unwrap_or(output), not_found(name, &names)));
+    match (missing.first(), inputs.first()) {
+        (Some(name), Some(input)) => Err(Failure::file(input, not_found(name, &names))),
+        _ => Ok(gathered),
     }
-    let outputs = match args.split {
-        false => vec![(output.clone(), grids)],
+}
+
+/// Which grids go to which file.
+fn outputs(args: &Args, output: &Path, grids: Vec<Grid>) -> Vec<(PathBuf, Vec<Grid>)> {
+    match args.split {
+        false => vec![(output.to_owned(), grids)],
         true => split(output, grids),
-    };
+    }
+}
+
+/// Converts files to one.
+fn convert(args: &Args, inputs: &[PathBuf], output: &Path, target: &Target) -> Result<(), Failure> {
+    let start = Instant::now();
+    if !args.split {
+        check_absent(output, args.force)?;
+    }
+    let Gathered { grids, metadata, bytes: input_bytes } = gather(args, inputs)?;
+    let outputs = outputs(args, output, grids);
     for (path, _) in &outputs {
         check_absent(path, args.force)?;
     }
+    // Anew, so that what was read wrongly once is noticed.
+    let sources = match args.verify {
+        true => self::outputs(args, output, gather(args, inputs)?.grids),
+        false => Vec::new(),
+    };
     let mut out = io::stdout().lock();
-    for (path, grids) in &outputs {
+    for (i, (path, grids)) in outputs.iter().enumerate() {
         let mut bytes = Vec::new();
         let written = match target {
             Target::Vdb(options) => nuage_vdb::write(grids, &metadata, options, &mut bytes),
@@ -262,15 +294,52 @@ fn convert(args: &Args, inputs: &[PathBuf], output: &PathBuf, target: &Target) -
         };
         // The inputs were sound, so nothing of the advice for damaged files applies.
         written.map_err(|error| Failure::file(path, format!("cannot write this: {error}")))?;
-        write_whole(path, &bytes, args.force).map_err(|error| Failure::file(path, error.to_string()))?;
+        let verified = write_whole_with(path, args.force, |file| -> Result<Option<String>, Written> {
+            let refused = |source| OutputError::Io { path: path.clone(), source };
+            file.write_all(&bytes).map_err(refused)?;
+            match (sources.get(i), target) {
+                (Some((_, sources)), Target::Vdb(_)) => {
+                    Ok(Some(verify::vdb(file, path, sources, &metadata, args.memory)?))
+                }
+                (Some((_, sources)), Target::Nano(options)) => {
+                    Ok(Some(verify::nano(file, path, sources, options, args.memory)?))
+                }
+                _ => Ok(None),
+            }
+        });
+        let verified = verified.map_err(|failure| match failure {
+            Written::Output(error) => Failure::file(path, error.to_string()),
+            Written::Verify(failure) => failure,
+        })?;
         let count = if grids.len() == 1 { "1 grid".to_owned() } else { format!("{} grids", grids.len()) };
         let ratio = number((bytes.len() as f64 / input_bytes.max(1) as f64 * 1000.0).round() / 10.0);
         let seconds = start.elapsed().as_secs_f64();
         let [from, to] = [input_bytes, bytes.len() as u64].map(thousands);
         let path = one_line(&path.display().to_string());
         writeln!(out, "{path}: {count}, {from} bytes to {to} ({ratio} %), {seconds:.2} s")?;
+        if let Some(verified) = verified {
+            writeln!(out, "  {verified}")?;
+        }
     }
     Ok(())
+}
+
+/// Why a file was not written.
+enum Written {
+    Output(OutputError),
+    Verify(Failure),
+}
+
+impl From<OutputError> for Written {
+    fn from(error: OutputError) -> Self {
+        Written::Output(error)
+    }
+}
+
+impl From<Failure> for Written {
+    fn from(failure: Failure) -> Self {
+        Written::Verify(failure)
+    }
 }
 
 /// What the name of the output and the options ask for.
@@ -288,12 +357,10 @@ fn target(args: &Args, output: &Path) -> Result<Target, Failure> {
         ("--half", args.half),
         ("--full", args.full),
     ];
-    let absolute = |bound: Option<Bound>| match bound {
-        None => Ok(0.0),
-        Some(Bound::Absolute(error)) => Ok(error),
-        Some(Bound::OfPeak(_)) => {
-            Err(Failure::Usage("--encoding fpn takes an error in the grid's own numbers".into()))
-        }
+    let absolute = |bounds: &[Asked<Bound>]| match bounds {
+        [] => Ok(0.0),
+        [Asked { name: None, value: Bound::Absolute(error) }] => Ok(*error),
+        _ => Err(Failure::Usage("--encoding fpn takes one error in the grids' own numbers".into())),
     };
     if !matches!(extension.as_deref(), Some("nuage")) {
         misplaced(&args.pack.given(), ".nuage")?;
@@ -303,8 +370,8 @@ fn target(args: &Args, output: &Path) -> Result<Target, Failure> {
             misplaced(
                 &[
                     ("--encoding", args.encoding.is_some()),
-                    ("--codec", args.codec.is_some()),
-                    ("--max-error", args.max_error.is_some()),
+                    ("--codec", !args.codec.is_empty()),
+                    ("--max-error", !args.max_error.is_empty()),
                 ],
                 ".nvdb",
             )?;
@@ -323,13 +390,15 @@ fn target(args: &Args, output: &Path) -> Result<Target, Failure> {
                 NanoEncoding::Fp16 => nano::Encoding::Fp16,
                 NanoEncoding::Fp8 => nano::Encoding::Fp8,
                 NanoEncoding::Fp4 => nano::Encoding::Fp4,
-                NanoEncoding::Fpn => nano::Encoding::FpN { max_error: absolute(args.max_error)? },
+                NanoEncoding::Fpn => nano::Encoding::FpN { max_error: absolute(&args.max_error)? },
             };
-            let codec = match args.codec {
-                None => nano::Codec::None,
-                Some(CodecChoice::Nano(codec)) => codec,
-                Some(CodecChoice::Packed(_)) => {
-                    return Err(Failure::Usage("the codecs of .nvdb files are none, zip and blosc".into()));
+            let codec = match args.codec.as_slice() {
+                [] => nano::Codec::None,
+                [Asked { name: None, value: CodecChoice::Nano(codec) }] => *codec,
+                _ => {
+                    return Err(Failure::Usage(
+                        "the codecs of .nvdb files are none, zip and blosc, one for all grids".into(),
+                    ));
                 }
             };
             Ok(Target::Nano(nano::WriteOptions { encoding, codec }))
@@ -337,14 +406,14 @@ fn target(args: &Args, output: &Path) -> Result<Target, Failure> {
         Some("nuage") => {
             misplaced(&of_vdb, ".vdb")?;
             misplaced(&[("--encoding", args.encoding.is_some())], ".nvdb")?;
-            let codec = match args.codec {
-                None => None,
-                Some(CodecChoice::Packed(codec)) => Some(codec),
-                Some(CodecChoice::Nano(_)) => {
-                    return Err(Failure::Usage("none, zip and blosc are codecs of .nvdb files".into()));
+            let codec = |asked: &Asked<CodecChoice>| match asked.value {
+                CodecChoice::Packed(codec) => Ok(Asked { name: asked.name.clone(), value: codec }),
+                CodecChoice::Nano(_) => {
+                    Err(Failure::Usage("none, zip and blosc are codecs of .nvdb files".into()))
                 }
             };
-            Ok(Target::Packed(args.pack.options(args.max_error, codec)?))
+            let codecs = args.codec.iter().map(codec).collect::<Result<Vec<_>, _>>()?;
+            Ok(Target::Packed(args.pack.options(&args.max_error, &codecs)?))
         }
         _ => {
             let output = output.display();

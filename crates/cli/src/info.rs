@@ -182,9 +182,13 @@ fn show_packed(path: &Path, out: &mut impl Write) -> Result<(), Failure> {
     )?;
     for channel in &contents.channels {
         let axis = channel.component.map_or("", |c| [".x", ".y", ".z"][usize::from(c.min(2))]);
+        let unit = match channel.physical_unit.as_str() {
+            "" => String::new(),
+            unit => format!(" {}", text::one_line(unit)),
+        };
         writeln!(
             out,
-            "  channel     {}{axis} ({:?}), peak {}, largest error {}",
+            "  channel     {}{axis} ({:?}), peak {}{unit}, largest error {}",
             text::one_line(&channel.name),
             channel.role,
             text::number(f64::from(channel.peak)),

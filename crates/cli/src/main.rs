@@ -24,6 +24,7 @@ mod text;
 mod texture;
 mod validate;
 mod values;
+mod verify;
 
 use std::process::ExitCode;
 
@@ -48,9 +49,9 @@ enum Command {
     Probe(probe::Args),
     Render(Box<render::Args>),
     Demo(demo::Args),
-    Diff(diff::Args),
+    Diff(Box<diff::Args>),
     Validate(validate::Args),
-    Convert(convert::Args),
+    Convert(Box<convert::Args>),
     Texture(texture::Args),
 }
 

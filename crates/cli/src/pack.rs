@@ -9,27 +9,39 @@ use std::time::Instant;
 
 use nuage_pipeline::output::{OutputError, write_whole_with};
 use nuage_pipeline::pack::assemble::Report;
-use nuage_pipeline::pack::frame::{Bound, Options};
+use nuage_pipeline::pack::options::{Bound, ChannelOptions, Options, unmet};
 use nuage_pipeline::pack::sequence::{FrameName, PackError, pack};
 use nuage_pipeline::sequence::{FrameFile, FrameRange};
 use nuage_volume::codec::Codec;
+use nuage_volume::format::Role;
 
 use crate::convert;
 use crate::error::Failure;
 use crate::progress;
 use crate::source::DiskFile;
 use crate::text::{number, one_line, thousands};
+use crate::verify;
 
 /// What is asked of a packed file.
 #[derive(Debug, Clone, clap::Args)]
 pub(crate) struct PackArgs {
-    /// The least signal-to-noise ratio of .nuage files in dB, in every frame [default: 45, unless another is asked for]
-    #[arg(long, value_name = "DB")]
-    psnr: Option<f64>,
+    /// The least signal-to-noise ratio of .nuage files in dB, over all frames [default: 45, unless something else is
+    /// asked for]
+    #[arg(long, value_name = "[NAME=]DB", value_parser = |text: &str| asked(text, amount))]
+    psnr: Vec<Asked<f64>>,
 
     /// The most bits per voxel of bricks that are not constant, in .nuage files
-    #[arg(long, value_name = "BITS")]
-    bits_per_voxel: Option<f64>,
+    #[arg(long, value_name = "[NAME=]BITS", value_parser = |text: &str| asked(text, amount))]
+    bits_per_voxel: Vec<Asked<f64>>,
+
+    /// What the values of a grid mean, in .nuage files: density, temperature, flame, velocity, signed-distance, colour or
+    /// other; may be repeated [default: what class and name of the grid say]
+    #[arg(long, value_name = "NAME=ROLE", value_parser = |text: &str| named(text, role))]
+    role: Vec<Asked<Role>>,
+
+    /// The unit of the values of a grid, kept in .nuage files, as in temperature=K; may be repeated
+    #[arg(long, value_name = "NAME=TEXT", value_parser = |text: &str| named(text, |unit| Ok(unit.to_owned())))]
+    unit: Vec<Asked<String>>,
 
     /// How many coarser levels of detail .nuage files get at most
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=12))]
@@ -48,12 +60,86 @@ pub(crate) struct PackArgs {
     pub(crate) frames: Option<FrameRange>,
 }
 
+/// A value that is asked of all channels, or of those of one grid.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Asked<T> {
+    /// The name of the grid.
+    pub(crate) name: Option<String>,
+    pub(crate) value: T,
+}
+
+/// `VALUE`, or `NAME=VALUE`. Names may hold a `=`, values none.
+pub(crate) fn asked<T>(text: &str, value: impl Fn(&str) -> Result<T, String>) -> Result<Asked<T>, String> {
+    match text.rsplit_once('=') {
+        Some(("", _)) => Err("a name is needed before the =".into()),
+        Some((name, text)) => Ok(Asked { name: Some(name.to_owned()), value: value(text)? }),
+        None => Ok(Asked { name: None, value: value(text)? }),
+    }
+}
+
+/// `NAME=VALUE`.
+fn named<T>(text: &str, value: impl Fn(&str) -> Result<T, String>) -> Result<Asked<T>, String> {
+    match text.contains('=') {
+        true => asked(text, value),
+        false => Err("write NAME=VALUE, with the name of a grid".into()),
+    }
+}
+
+fn amount(text: &str) -> Result<f64, String> {
+    match text.trim().parse::<f64>() {
+        Ok(x) if x > 0.0 && x.is_finite() => Ok(x),
+        _ => Err("a number above 0 is needed".into()),
+    }
+}
+
+fn role(text: &str) -> Result<Role, String> {
+    match text {
+        "density" => Ok(Role::Density),
+        "temperature" => Ok(Role::Temperature),
+        "flame" => Ok(Role::Flame),
+        "velocity" => Ok(Role::Velocity),
+        "signed-distance" => Ok(Role::SignedDistance),
+        "colour" | "color" => Ok(Role::Colour),
+        "other" => Ok(Role::Other),
+        _ => Err("there are density, temperature, flame, velocity, signed-distance, colour and other".into()),
+    }
+}
+
+/// Puts what was given for one option into the options of all channels and of single ones. That of all is returned.
+fn spread<T: Clone>(
+    option: &str,
+    given: &[Asked<T>],
+    channels: &mut Vec<(String, ChannelOptions)>,
+    set: impl Fn(&mut ChannelOptions) -> &mut Option<T>,
+) -> Result<Option<T>, Failure> {
+    let mut general = None;
+    for Asked { name, value } in given {
+        let slot = match name {
+            None => &mut general,
+            Some(name) => {
+                let i = channels.iter().position(|(other, _)| other == name).unwrap_or_else(|| {
+                    channels.push((name.clone(), ChannelOptions::default()));
+                    channels.len() - 1
+                });
+                set(&mut channels[i].1)
+            }
+        };
+        if slot.replace(value.clone()).is_some() {
+            let whom = name.as_ref().map_or("all channels".to_owned(), |name| format!("'{name}'"));
+            return Err(Failure::Usage(format!("{option} is given twice for {whom}")));
+        }
+    }
+    Ok(general)
+}
+
 impl PackArgs {
     /// The names of the options that were given, which are for packed files alone.
-    pub(crate) fn given(&self) -> [(&'static str, bool); 5] {
+    pub(crate) fn given(&self) -> [(&'static str, bool); 7] {
         [
-            ("--psnr", self.psnr.is_some()),
-            ("--bits-per-voxel", self.bits_per_voxel.is_some()),
+            ("--psnr", !self.psnr.is_empty()),
+            ("--bits-per-voxel", !self.bits_per_voxel.is_empty()),
+            ("--role", !self.role.is_empty()),
+            ("--unit", !self.unit.is_empty()),
             ("--levels", self.levels > 0),
             ("--shapes", self.shapes > 0),
             ("--fps", self.fps.is_some()),
@@ -64,25 +150,33 @@ impl PackArgs {
     ///
     /// # Errors
     /// If they make no sense, in words.
-    pub(crate) fn options(&self, max_error: Option<Bound>, codec: Option<Codec>) -> Result<Options, Failure> {
-        let is_amount = |value: Option<f64>| value.is_none_or(|value| value.is_finite() && value > 0.0);
-        for (name, value) in
-            [("--psnr", self.psnr), ("--bits-per-voxel", self.bits_per_voxel), ("--fps", self.fps)]
-        {
-            if !is_amount(value) {
-                return Err(Failure::Usage(format!("{name} must be a number above 0")));
-            }
+    pub(crate) fn options(
+        &self,
+        max_errors: &[Asked<Bound>],
+        codecs: &[Asked<Codec>],
+    ) -> Result<Options, Failure> {
+        if self.fps.is_some_and(|rate| !rate.is_finite() || rate <= 0.0) {
+            return Err(Failure::Usage("--fps must be a number above 0".into()));
         }
-        let nothing_asked =
-            self.psnr.is_none() && self.bits_per_voxel.is_none() && max_error.is_none() && codec.is_none();
+        let mut channels = Vec::new();
+        let max_error = spread("--max-error", max_errors, &mut channels, |asked| &mut asked.max_error)?;
+        let psnr = spread("--psnr", &self.psnr, &mut channels, |asked| &mut asked.psnr)?;
+        let bits = spread("--bits-per-voxel", &self.bits_per_voxel, &mut channels, |asked| {
+            &mut asked.bits_per_voxel
+        })?;
+        let codec = spread("--codec", codecs, &mut channels, |asked| &mut asked.codec)?;
+        spread("--role", &self.role, &mut channels, |asked| &mut asked.role)?;
+        spread("--unit", &self.unit, &mut channels, |asked| &mut asked.physical_unit)?;
+        let nothing_asked = max_error.is_none() && psnr.is_none() && bits.is_none() && codec.is_none();
         let default = Options::default();
         Ok(Options {
             max_error: if nothing_asked { default.max_error } else { max_error },
-            psnr: if nothing_asked { default.psnr } else { self.psnr },
-            bits_per_voxel: self.bits_per_voxel,
+            psnr: if nothing_asked { default.psnr } else { psnr },
+            bits_per_voxel: bits,
             codec,
             coarser_levels: self.levels,
             shapes: self.shapes,
+            channels,
         })
     }
 }
@@ -132,12 +226,19 @@ pub(crate) fn run(
     let load = |frame: usize| convert::load(args, &frames[frame].path);
     let written = write_whole_with(output, args.force, |file| {
         let mut done = |part: f64| bar.set_position((part * 1000.0) as u64);
-        pack(&names, load, BufWriter::new(file), options, args.pack.fps, &mut done).map_err(PackFailure::Pack)
+        let packed = pack(&names, load, BufWriter::new(&mut *file), options, args.pack.fps, &mut done);
+        let (report, plan) = packed.map_err(PackFailure::Pack)?;
+        // What is wrong never gets the name that was asked for.
+        let verified = match args.verify {
+            true => Some(verify::packed(file, output, frames, args, &report).map_err(PackFailure::Verify)?),
+            false => None,
+        };
+        Ok((report, plan, verified))
     });
     bar.finish_and_clear();
-    let (report, plan) = written.map_err(|failure| match failure {
+    let (report, plan, verified) = written.map_err(|failure| match failure {
         PackFailure::Output(error) => Failure::file(output, error.to_string()),
-        PackFailure::Pack(PackError::Load(failure)) => failure,
+        PackFailure::Pack(PackError::Load(failure)) | PackFailure::Verify(failure) => failure,
         PackFailure::Pack(other) => Failure::file(output, other.to_string()),
     })?;
     for what in &plan.left_out {
@@ -149,6 +250,12 @@ pub(crate) fn run(
     let input_bytes =
         frames.iter().map(|frame| DiskFile::open(&frame.path).map_or(0, |file| file.size())).sum();
     print(&report, output, input_bytes, start.elapsed().as_secs_f64())?;
+    if let Some(verified) = verified {
+        writeln!(io::stdout(), "  {verified}")?;
+    }
+    for missed in unmet(&report, options) {
+        let _ = writeln!(io::stderr(), "nuage: not met: {}", one_line(&missed.to_string()));
+    }
     Ok(())
 }
 
@@ -156,6 +263,7 @@ pub(crate) fn run(
 enum PackFailure {
     Output(OutputError),
     Pack(PackError<Failure>),
+    Verify(Failure),
 }
 
 impl From<OutputError> for PackFailure {
@@ -208,12 +316,9 @@ fn print(report: &Report, output: &Path, input_bytes: u64, seconds: f64) -> io::
             .map_or(String::new(), |c| format!(".{}", ["x", "y", "z"][usize::from(c.min(2))]));
         let quality = channel.quality;
         let error = number(f64::from(quality.max_error));
-        let psnr = match quality.squared_error > 0.0 {
-            true => {
-                let mean = quality.squared_error / quality.voxels.max(1) as f64;
-                format!("{} dB", rounded(10.0 * (f64::from(channel.peak).powi(2) / mean).log10(), 2))
-            }
-            false => "exact".to_owned(),
+        let psnr = match quality.psnr(channel.peak) {
+            psnr if psnr.is_finite() => format!("{} dB", rounded(psnr, 2)),
+            _ => "exact".to_owned(),
         };
         writeln!(
             out,
@@ -234,5 +339,28 @@ mod tests {
         assert_eq!(bound("0.25"), Ok(Bound::Absolute(0.25)));
         assert_eq!(bound("3%"), Ok(Bound::OfPeak(0.03)));
         assert!(bound("-1").is_err() && bound("x%").is_err() && bound("inf").is_err());
+    }
+
+    #[test]
+    fn a_value_may_be_for_one_grid() {
+        let asked = |text: &str| asked(text, bound);
+        assert_eq!(asked("3%"), Ok(Asked { name: None, value: Bound::OfPeak(0.03) }));
+        let of = |name: &str| Ok(Asked { name: Some(name.to_owned()), value: Bound::Absolute(2.0) });
+        assert_eq!(asked("heat=2"), of("heat"));
+        assert_eq!(asked("a=b=2"), of("a=b"));
+        assert!(asked("=2").is_err() && asked("heat=x").is_err());
+        assert!(named("density", role).is_err() && named("density=smoke", role).is_err());
+        assert_eq!(named("x=signed-distance", role).unwrap().value, Role::SignedDistance);
+    }
+
+    #[test]
+    fn the_same_is_not_asked_twice() {
+        let twice = |names: [Option<&str>; 2]| {
+            let given = names.map(|name| Asked { name: name.map(str::to_owned), value: 1.0 });
+            let mut channels = Vec::new();
+            spread("--psnr", &given, &mut channels, |asked| &mut asked.psnr).is_err()
+        };
+        assert!(twice([None, None]) && twice([Some("a"), Some("a")]));
+        assert!(!twice([None, Some("a")]) && !twice([Some("b"), Some("a")]));
     }
 }

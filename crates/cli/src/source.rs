@@ -70,9 +70,17 @@ impl DiskFile {
         if !kind.is_file() {
             return Err(Failure::file(path, "this is no regular file: copy it to disk first"));
         }
-        let file = fs::File::open(path).map_err(cannot_open)?;
-        let size_bytes = file.metadata().map_err(cannot_open)?.len();
-        Ok(DiskFile { path: path.to_owned(), file, size_bytes, frame: None })
+        Self::of(path, fs::File::open(path).map_err(cannot_open)?)
+    }
+
+    /// A file that is open already, as it is. `path` is what messages call it.
+    ///
+    /// # Errors
+    /// If the system does not say how large it is.
+    pub(crate) fn of(path: &Path, file: fs::File) -> Result<Self, Failure> {
+        let data =
+            file.metadata().map_err(|error| Failure::file(path, format!("cannot read it: {error}")))?;
+        Ok(DiskFile { path: path.to_owned(), file, size_bytes: data.len(), frame: None })
     }
 
     /// Reads the header of the file as a VDB file.

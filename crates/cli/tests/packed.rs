@@ -87,7 +87,7 @@ fn differences(a: &str, b: &str) -> Vec<f64> {
     assert!(matches!(output.status.code(), Some(0 | 1)), "{}", stderr(&output));
     let object: Value = serde_json::from_str(stdout(&output)).unwrap();
     let grids = object["grids"].as_array().unwrap();
-    grids.iter().map(|grid| grid["voxels"]["max_difference"].as_f64().unwrap_or(0.0)).collect()
+    grids.iter().map(|grid| grid["voxels"]["max_error"].as_f64().unwrap()).collect()
 }
 
 fn info(path: &str) -> Value {
@@ -148,9 +148,11 @@ fn every_subcommand_reads_frames() {
         assert!(succeeds(["validate", path]).contains("valid"));
         assert!(succeeds(["diff", path, path]).ends_with("equal\n"));
     }
-    // The first frame is the one that is meant without a number.
-    assert!(nuage(["diff", &path, &format!("{path}#2")]).status.success());
-    assert!(!nuage(["diff", &path, &frame]).status.success());
+    // Of a sequence, the frame that is held against one of a number is that of this number.
+    for frame in ["#2", "#4"].map(|number| format!("{path}{number}")) {
+        assert!(nuage(["diff", &path, &frame]).status.success());
+    }
+    assert!(!nuage(["diff", &format!("{path}#2"), &frame]).status.success());
     let name = info(&frame)["grids"][0]["name"].as_str().unwrap().to_owned();
     let probe = |path: &str| {
         let grid = format!("--grid={name}");
@@ -181,8 +183,8 @@ fn what_makes_no_sense_is_said() {
     let (input, output) = (blast("0001"), folder.at("out.nuage"));
     let input = input.to_str().unwrap();
     for (options, says) in [
-        (&["--psnr=0"][..], "--psnr must be"),
-        (&["--psnr=nan"], "--psnr must be"),
+        (&["--psnr=0"][..], "a number above 0"),
+        (&["--psnr=nan"], "a number above 0"),
         (&["--bits-per-voxel=-1"], "--bits-per-voxel"),
         (&["--max-error=-1"], "0 or above"),
         (&["--max-error=big"], "write a number"),
@@ -286,4 +288,187 @@ fn a_conversion_that_is_killed_leaves_nothing_or_all() {
             after.map(|bytes| bytes.len())
         );
     }
+}
+
+/// What `diff --json` says.
+fn diff(args: &[&str]) -> (bool, Value) {
+    let output = nuage(["diff", "--json"].iter().chain(args));
+    assert!(matches!(output.status.code(), Some(0 | 1)), "{}", stderr(&output));
+    (output.status.success(), serde_json::from_str(stdout(&output)).unwrap())
+}
+
+#[test]
+fn sequences_are_compared_frame_by_frame() {
+    let folder = folder();
+    let (input, packed) = (blast("####"), folder.at("blast.nuage"));
+    let input = input.to_str().unwrap();
+    let (equal, all) = diff(&["--values-only", "--frames=2-4", input, &packed]);
+    let frames = all["frames"].as_array().unwrap();
+    assert_eq!(frames.iter().map(|frame| frame["frame"].as_i64().unwrap()).collect::<Vec<_>>(), FRAMES);
+    assert!(!equal && all["equal"] == false);
+    // The whole is the sum of the parts, with one peak and the worst frame.
+    let totals = all["total"].as_array().unwrap();
+    let names: Vec<&str> = totals.iter().map(|total| total["name"].as_str().unwrap()).collect();
+    assert_eq!(names, ["density", "flame", "temperature"]);
+    let total = &totals[0];
+    let of = |key: &str| -> Vec<f64> {
+        frames.iter().map(|frame| frame["grids"][0]["voxels"][key].as_f64().unwrap()).collect()
+    };
+    let voxels = &total["voxels"];
+    let largest = of("max_error").into_iter().fold(0.0, f64::max);
+    assert!(largest > 0.0 && voxels["max_error"].as_f64() == Some(largest));
+    let worst = of("max_error").iter().position(|error| *error == largest).unwrap();
+    assert_eq!(voxels["worst_frame"].as_i64(), Some(FRAMES[worst]));
+    assert!(of("peak").iter().all(|peak| Some(*peak) == voxels["peak"].as_f64()));
+    let (psnr, ratios) = (voxels["psnr"].as_f64().unwrap(), of("psnr"));
+    let least = ratios.iter().copied().fold(f64::INFINITY, f64::min);
+    assert!(least <= psnr && psnr <= ratios.into_iter().fold(0.0, f64::max), "{psnr}");
+    let [a, b] = [0, 1].map(|i| voxels["max_error_values"][i].as_f64().unwrap());
+    assert!(((a - b).abs() - largest).abs() < 1e-9 * largest, "{a} {b} {largest}");
+    // What was asked for when packing.
+    let peak = voxels["peak"].as_f64().unwrap();
+    assert!(largest <= 0.005 * peak * 1.001 && voxels["fog"].as_f64().unwrap() <= 1.001e-3 * peak);
+    // In words.
+    let said = stdout(&nuage(["diff", "--values-only", "--frames=2-4", input, &packed])).to_owned();
+    let place = format!("of frame {} (", FRAMES[worst]);
+    assert!(said.contains("all 3 frames:") && said.contains(&place) && said.contains("PSNR"), "{said}");
+    // Frames of one side alone, and none in common.
+    let (_, missing) = diff(&["--tolerance=1000", "--values-only", input, &packed]);
+    assert!(missing["frames_only_a"].as_array().unwrap().contains(&Value::from(1)));
+    assert_eq!(
+        (&missing["frames_only_b"], &missing["equal"]),
+        (&Value::from(Vec::<i64>::new()), &Value::Bool(false))
+    );
+    // One frame against a sequence is that of its number.
+    let four = blast("0004");
+    let (_, one) = diff(&["--values-only", four.to_str().unwrap(), &packed]);
+    assert_eq!(one["grids"][0]["voxels"]["max_error"], frames[2]["grids"][0]["voxels"]["max_error"]);
+    fails(["diff", blast("0001").to_str().unwrap(), &packed], 1, "there is no frame 1");
+}
+
+#[test]
+fn a_difference_has_a_picture() {
+    let folder = folder();
+    let (input, packed, picture) = (blast("####"), folder.at("blast.nuage"), folder.at("out.png"));
+    let look = "--up z --size 24 --step 4 --shadow-step 8 --sun-rays 1 --sky-rays 1";
+    let args = ["diff", "--frames=2-4", input.to_str().unwrap(), &packed, "--picture", &picture];
+    let args: Vec<&str> = args.into_iter().chain(look.split_whitespace()).collect();
+    let with = |more: &[&'static str]| nuage(args.iter().chain(more));
+    let output = with(&["--frame=3", "--amplify=4"]);
+    assert!(
+        stdout(&output).contains("out.png: A, B and their difference times 4 of frame 3"),
+        "{}",
+        stdout(&output)
+    );
+    let pixels = |path: &str| {
+        let file = std::io::BufReader::new(fs::File::open(path).unwrap());
+        let mut reader = png::Decoder::new(file).read_info().unwrap();
+        let mut pixels = vec![0; reader.output_buffer_size().unwrap()];
+        let frame = reader.next_frame(&mut pixels).unwrap();
+        (frame.width as usize, frame.height, pixels)
+    };
+    let (width, height, bytes) = pixels(&picture);
+    assert_eq!((width, height), (3 * 24 + 2 * 4, 24));
+    let channels = bytes.len() / (width * 24);
+    let at = |x: usize, y: usize| &bytes[(y * width + x) * channels..][..3];
+    // What is the same in A and B is black, and something differs.
+    let columns = || (0..24).flat_map(|x| (0..24).map(move |y| (x, y)));
+    assert!(columns().all(|(x, y)| at(x, y) == at(x + 28, y)
+        || at(x + 56, y) != [0; 3]
+        || at(x, y).iter().zip(at(x + 28, y)).all(|(a, b)| a.abs_diff(*b) <= 1)));
+    assert!(columns().any(|(x, y)| at(x + 56, y) != [0; 3]));
+    // The left part is the picture that `render` makes.
+    let render = folder.at("render.png");
+    let three = blast("0003");
+    succeeds(
+        ["render", three.to_str().unwrap(), "--output", &render].into_iter().chain(look.split_whitespace()),
+    );
+    let (_, _, alone) = pixels(&render);
+    let alone_channels = alone.len() / (24 * 24);
+    assert!(columns().all(|(x, y)| alone[(y * 24 + x) * alone_channels..][..3] == *at(x, y)));
+    // Nothing is replaced unasked, nor is a frame shown that is not there.
+    let before = fs::read(&picture).unwrap();
+    let refused = with(&[]);
+    assert!(refused.status.code() == Some(1) && stderr(&refused).contains("--force"), "{}", stderr(&refused));
+    assert_eq!(fs::read(&picture).unwrap(), before);
+    assert!(stdout(&with(&["--force"])).contains("difference times"));
+    assert_eq!(with(&["--force", "--frame=9"]).status.code(), Some(2));
+    fails(["diff", &packed, &packed, "--picture", &folder.at("out.jpg")], 2, ".png");
+    fails(["diff", &packed, &packed, "--frame=2"], 2, "--picture");
+}
+
+#[test]
+fn a_written_file_is_verified_before_it_gets_its_name() {
+    let folder = Folder(tempfile::tempdir().unwrap());
+    let input = blast("####");
+    let input = input.to_str().unwrap();
+    for options in [&["--max-error=1%"][..], &["--psnr=50", "--levels=2"], &["--codec=f16"], &["--codec=f32"]]
+    {
+        let args = ["convert", "--verify", "--force", "--frames=2-4"];
+        let output = folder.at("out.nuage");
+        let said = succeeds(args.iter().chain(options).chain(&[input, output.as_str()]));
+        assert!(said.contains("verified: ") && said.contains("3 frames, 3 channels;"), "{said}");
+    }
+    let before = fs::read(folder.at("out.nuage")).unwrap();
+    // A codec that makes a larger error than is asked for.
+    let args = ["convert", "--verify", "--force", "--frames=2-4", "--codec=u2", "--max-error=1%", input];
+    fails(args.iter().chain(&[folder.at("out.nuage").as_str()]), 1, "verifying failed");
+    assert!(fs::read(folder.at("out.nuage")).unwrap() == before);
+    let sphere = testkit::committed("data/edge").join("comp_sphere_mask.vdb");
+    let sphere = sphere.to_str().unwrap();
+    for (options, output, says) in [
+        (&[][..], "a.vdb", "came back equal"),
+        (&["--compression=zip"], "b.vdb", "came back equal"),
+        (&["--half"], "c.vdb", "came back equal"),
+        (&[], "d.nvdb", "came back equal"),
+        (&["--encoding=fp8", "--codec=zip"], "e.nvdb", "no error above"),
+        (&["--encoding=fp4"], "f.nvdb", "no error above"),
+        (&["--encoding=fpn", "--max-error=0.01"], "g.nvdb", "no error above"),
+    ] {
+        let path = folder.at(output);
+        let said = succeeds(["convert", "--verify"].iter().chain(options).chain(&[sphere, path.as_str()]));
+        assert!(said.contains("verified: 2 grids") && said.contains(says), "{output}: {said}");
+    }
+    assert_eq!(folder.names().len(), 8);
+}
+
+#[test]
+fn options_of_packing_may_be_for_one_grid() {
+    let folder = Folder(tempfile::tempdir().unwrap());
+    let (input, output) = (blast("0003"), folder.at("out.nuage"));
+    let input = input.to_str().unwrap();
+    let name = info(input)["grids"][0]["name"].as_str().unwrap().to_owned();
+    let convert = |options: &[String]| {
+        let fixed = ["convert", "--force", input, &output].map(str::to_owned);
+        nuage(fixed.iter().chain(options))
+    };
+    let role_and_unit = [format!("--role={name}=flame"), format!("--unit={name}=1/m")];
+    let made =
+        convert(&[&role_and_unit[..], &["--codec=u2".into(), format!("--max-error={name}=0.2%")]].concat());
+    assert!(made.status.success() && stderr(&made).is_empty(), "{}", stderr(&made));
+    let said = succeeds(["info", &output]);
+    assert!(said.contains("(Flame)") && said.contains(" 1/m, largest error"), "{said}");
+    // What cannot be had together is said, and the file is there.
+    let made = convert(&["--max-error=0.1%".into(), "--bits-per-voxel=1".into()]);
+    assert!(
+        made.status.success() && stderr(&made).contains("bits per voxel are above the 1 asked for"),
+        "{made:?}"
+    );
+    let made = convert(&["--psnr=90".into(), "--bits-per-voxel=2".into()]);
+    assert!(made.status.success() && stderr(&made).contains("below the 90 asked for"), "{made:?}");
+    let wrong = convert(&["--psnr=smoke=40".into()]);
+    let says = format!("'smoke', which is in no frame; there are: {name}");
+    assert!(wrong.status.code() == Some(1) && stderr(&wrong).contains(&says), "{}", stderr(&wrong));
+    for (options, says) in [
+        (&["--psnr=40", "--psnr=50"][..], "given twice for all channels"),
+        (&["--unit=a=K", "--unit=a=C"], "given twice for 'a'"),
+        (&["--role=smoke"], "NAME=VALUE"),
+        (&["--role=a=smoke"], "there are density"),
+    ] {
+        let options: Vec<String> = options.iter().map(|option| (*option).to_owned()).collect();
+        let made = convert(&options);
+        assert!(made.status.code() == Some(2) && stderr(&made).contains(says), "{}", stderr(&made));
+    }
+    fails(["convert", "--unit=a=K", input, &folder.at("x.vdb")], 2, "--unit is for");
+    fails(["convert", "--codec=a=zip", input, &folder.at("x.nvdb")], 2, "one for all grids");
 }

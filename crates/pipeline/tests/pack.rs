@@ -10,7 +10,7 @@ use std::io::Cursor;
 use glam::IVec3;
 use half::f16;
 use nuage_pipeline::pack::assemble::Report;
-use nuage_pipeline::pack::frame::{Bound, Options};
+use nuage_pipeline::pack::options::{Asked, Bound, ChannelOptions, Options, unmet};
 use nuage_pipeline::pack::plan::Plan;
 use nuage_pipeline::pack::sequence::{FrameName, PackError, pack};
 use nuage_pipeline::pack::unpack::unpack_frame;
@@ -20,7 +20,7 @@ use nuage_vdb::{
 };
 use nuage_volume::codec::Codec;
 use nuage_volume::codec::block::{BlockFormat, PackingAxis};
-use nuage_volume::format::{Asset, FrameGrid};
+use nuage_volume::format::{Asset, FrameGrid, Role};
 use nuage_volume::packed::{Content, Entry, Node, TreeRef, mask};
 use nuage_volume::space::{NODE4_SLOTS, NODE5_SLOTS, node4_slot, node5_slot, root_cell};
 use proptest::prelude::*;
@@ -41,8 +41,15 @@ impl Packed {
 }
 
 /// Options that ask for nothing.
-const NOTHING: Options =
-    Options { max_error: None, psnr: None, bits_per_voxel: None, codec: None, coarser_levels: 0, shapes: 0 };
+const NOTHING: Options = Options {
+    max_error: None,
+    psnr: None,
+    bits_per_voxel: None,
+    codec: None,
+    coarser_levels: 0,
+    shapes: 0,
+    channels: Vec::new(),
+};
 
 fn packed(frames: &[Frame], options: &Options) -> Packed {
     let names: Vec<FrameName> = (0..frames.len())
@@ -842,4 +849,69 @@ fn frames_of_sequences_come_back() {
     ] {
         testkit::find(path).iter().for_each(|path| check_file(path));
     }
+}
+
+#[test]
+fn a_channel_gets_what_is_asked_of_it_by_name() {
+    let noisy = |seed| tree_of(&Recipe { seed, ..lively() });
+    let frames = still(vec![grid("density", noisy(5)), grid("heat", noisy(6)), grid("other", noisy(7))]);
+    let asked = |name: &str, asked: ChannelOptions| (name.to_owned(), asked);
+    let named = vec![
+        asked("density", ChannelOptions { codec: Some(Codec::Uniform { bits: 2 }), ..Default::default() }),
+        asked(
+            "heat",
+            ChannelOptions {
+                max_error: Some(Bound::Absolute(1e-3)),
+                role: Some(Role::Temperature),
+                physical_unit: Some("K".into()),
+                ..Default::default()
+            },
+        ),
+    ];
+    let options = Options { codec: Some(Codec::F32), channels: named, ..NOTHING };
+    let all = packed(&frames, &options);
+    let [density, heat, other] = all.asset.contents().channels.as_slice() else { panic!("three channels") };
+    assert!(density.quality.max_error > 0.1, "{:?}", density.quality);
+    assert!(heat.quality.max_error > 0.0 && heat.quality.max_error <= 1e-3, "{:?}", heat.quality);
+    assert_eq!(
+        (heat.role, heat.physical_unit.as_str(), heat.asked_max_error),
+        (Role::Temperature, "K", Some(1e-3))
+    );
+    assert_eq!((other.quality.max_error, other.physical_unit.as_str()), (0.0, ""));
+    assert_eq!(unmet(&all.report, &options), []);
+    // Each as if it stood alone.
+    let alone = packed(
+        &still(vec![grid("heat", noisy(6))]),
+        &Options { channels: options.channels[1..].to_vec(), ..NOTHING },
+    );
+    assert_eq!(alone.asset.contents().channels[0].quality, heat.quality);
+    let wrong = Options { channels: vec![asked("smoke", ChannelOptions::default())], ..options };
+    let load = |_| Ok::<_, Infallible>(frames[0].clone());
+    let name = [FrameName { number: None, name: String::new() }];
+    let error = pack(&name, load, Cursor::new(Vec::new()), &wrong, None, &mut |_| {}).unwrap_err();
+    assert!(
+        error.to_string().ends_with("'smoke', which is in no frame; there are: density, heat, other"),
+        "{error}"
+    );
+}
+
+#[test]
+fn what_cannot_be_met_is_known() {
+    let frames = still(vec![grid("density", tree_of(&lively()))]);
+    let missed = |options: &Options| -> Vec<Asked> {
+        unmet(&packed(&frames, options).report, options).into_iter().map(|unmet| unmet.what).collect()
+    };
+    let bound = Some(Bound::OfPeak(1e-4));
+    assert_eq!(missed(&Options { bits_per_voxel: Some(33.0), max_error: bound, ..NOTHING }), []);
+    assert_eq!(
+        missed(&Options { bits_per_voxel: Some(2.0), max_error: bound, ..NOTHING }),
+        [Asked::BitsPerVoxel]
+    );
+    assert_eq!(missed(&Options { psnr: Some(90.0), ..NOTHING }), []);
+    assert_eq!(missed(&Options { psnr: Some(90.0), bits_per_voxel: Some(8.0), ..NOTHING }), [Asked::Psnr]);
+    let coarse = Options { codec: Some(Codec::Uniform { bits: 2 }), ..NOTHING };
+    assert_eq!(
+        missed(&Options { psnr: Some(60.0), max_error: bound, ..coarse }),
+        [Asked::MaxError, Asked::Psnr]
+    );
 }

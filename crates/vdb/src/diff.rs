@@ -60,9 +60,7 @@ pub struct GridDifference {
 
 /// How the voxels of two grids differ, over all regions that at least one of them stores.
 ///
-/// Of each count, tiles make up as many voxels as they fill. Means are taken over the voxels of the first side, the
-/// source, that differ from its background; with [`Options::active_only`], of those over the voxels that are active on
-/// a side.
+/// Of each count, tiles make up as many voxels as they fill.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct VoxelDifference {
     /// Voxels that are active on at least one side.
@@ -75,24 +73,80 @@ pub struct VoxelDifference {
     pub differing_states: u64,
     /// Voxels of which one value is NaN or infinite and the other is not the same. They are in no mean.
     pub not_finite: u64,
-    /// The largest finite distance between two values; of vectors, between two components.
-    pub max_error: f64,
-    /// Where it is met first; of a tile, its smallest coordinate. `None` if all values are equal.
-    pub max_error_at: Option<[i32; 3]>,
-    /// The sum of all finite distances over the voxels that means are taken of.
-    pub sum_of_errors: f64,
-    /// The sum of their squares.
-    pub sum_of_squares: f64,
-    /// How many distances these are sums of: one per voxel, or three for vectors.
-    pub compared: u64,
-    /// The largest finite absolute value of the voxels of the first side that means are taken of.
-    pub peak: f64,
+    /// The errors of each component; of values that are no vectors, of the first.
+    pub components: [Errors; 3],
     /// Nodes and leaves of the first side where the other has a tile or nothing.
     pub nodes_only_in_a: u64,
     /// The reverse.
     pub nodes_only_in_b: u64,
     /// Coordinates of the first differing voxels; of a tile, its smallest one.
     pub first: Vec<[i32; 3]>,
+}
+
+/// How far numbers are from those of the first side, the source, over some regions.
+///
+/// Means are taken over the voxels of the source that differ from its background; with [`Options::active_only`], of
+/// those over the voxels that are active on a side. The largest error is that of all voxels.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Errors {
+    /// The largest finite distance between two numbers.
+    pub max: f64,
+    /// Where it is met first; of a tile, its smallest coordinate. `None` if all numbers are equal.
+    pub max_at: Option<[i32; 3]>,
+    /// The two numbers there.
+    pub max_values: [f64; 2],
+    /// The sum of all finite distances over the voxels that means are taken of.
+    pub sum: f64,
+    /// The sum of their squares.
+    pub squares: f64,
+    /// How many distances these are sums of.
+    pub compared: u64,
+    /// The sum of squared finite distances over all other voxels, where the source has its background.
+    pub background_squares: f64,
+    /// The largest finite distance over these: fog where there was none.
+    pub fog: f64,
+    /// Where it is met first.
+    pub fog_at: Option<[i32; 3]>,
+    /// Voxels whose number is negative on one side alone.
+    pub sign_changes: u64,
+    /// The largest finite absolute value of the source, its background included.
+    pub peak: f64,
+}
+
+impl Errors {
+    /// The mean distance.
+    pub fn mean(&self) -> f64 {
+        self.sum / self.compared.max(1) as f64
+    }
+
+    /// The root of the mean squared distance.
+    pub fn rms(&self) -> f64 {
+        (self.squares / self.compared.max(1) as f64).sqrt()
+    }
+
+    /// The peak signal-to-noise ratio in decibels, `10·log10(peak² / MSE)`; infinite for equal values.
+    pub fn psnr(&self) -> f64 {
+        match self.rms() {
+            0.0 => f64::INFINITY,
+            rms => 20.0 * (self.peak / rms).log10(),
+        }
+    }
+
+    /// Adds the errors of other numbers: another region, component or frame.
+    pub fn merge(&mut self, other: &Errors) {
+        if other.max > self.max {
+            (self.max, self.max_at, self.max_values) = (other.max, other.max_at, other.max_values);
+        }
+        if other.fog > self.fog {
+            (self.fog, self.fog_at) = (other.fog, other.fog_at);
+        }
+        self.sum += other.sum;
+        self.squares += other.squares;
+        self.compared = self.compared.saturating_add(other.compared);
+        self.background_squares += other.background_squares;
+        self.sign_changes = self.sign_changes.saturating_add(other.sign_changes);
+        self.peak = self.peak.max(other.peak);
+    }
 }
 
 impl VoxelDifference {
@@ -104,22 +158,26 @@ impl VoxelDifference {
             && self.not_finite == 0
     }
 
-    /// The mean distance.
-    pub fn mean_error(&self) -> f64 {
-        self.sum_of_errors / self.compared.max(1) as f64
+    /// The errors of all components together.
+    pub fn errors(&self) -> Errors {
+        let mut all = Errors::default();
+        self.components.iter().for_each(|component| all.merge(component));
+        all
     }
 
-    /// The root of the mean squared distance.
-    pub fn rms_error(&self) -> f64 {
-        (self.sum_of_squares / self.compared.max(1) as f64).sqrt()
-    }
-
-    /// The peak signal-to-noise ratio in decibels, `10·log10(peak² / MSE)`; infinite for equal values.
-    pub fn psnr(&self) -> f64 {
-        match self.rms_error() {
-            0.0 => f64::INFINITY,
-            rms => 20.0 * (self.peak / rms).log10(),
-        }
+    /// Adds what was found in another region, or another frame. Of the differing voxels no more than `listed` stay.
+    pub fn merge(&mut self, other: VoxelDifference, listed: usize) {
+        let plus = |count: &mut u64, more: u64| *count = count.saturating_add(more);
+        plus(&mut self.active, other.active);
+        plus(&mut self.differing_values, other.differing_values);
+        plus(&mut self.differing_inactive_values, other.differing_inactive_values);
+        plus(&mut self.differing_states, other.differing_states);
+        plus(&mut self.not_finite, other.not_finite);
+        plus(&mut self.nodes_only_in_a, other.nodes_only_in_a);
+        plus(&mut self.nodes_only_in_b, other.nodes_only_in_b);
+        self.components.iter_mut().zip(&other.components).for_each(|(errors, other)| errors.merge(other));
+        self.first.extend(other.first);
+        self.first.truncate(listed);
     }
 }
 

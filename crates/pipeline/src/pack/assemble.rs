@@ -17,7 +17,8 @@ use nuage_volume::packed::TreeRef;
 use nuage_volume::packed::build::{EntryScale, Packer, TooLarge};
 use nuage_volume::space::BRICK_VOXELS;
 
-use super::frame::{EncodedFrame, EncodedGrid, EncodedLevel, Options};
+use super::frame::{ENTRY_WORDS, EncodedFrame, EncodedGrid, EncodedLevel};
+use super::options::Options;
 use super::plan::Plan;
 use crate::each;
 use crate::encode::shapes::{SHAPE_CODEC, Shapes};
@@ -55,6 +56,27 @@ pub struct Report {
     pub source_bricks: u64,
     /// The bricks that are stored, of all levels.
     pub bricks_stored: u64,
+    /// What each channel takes.
+    pub channels: Vec<ChannelSize>,
+}
+
+/// What a channel takes over all frames, at its finest level and before equal bricks become one.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct ChannelSize {
+    /// The bricks of the source that are not constant.
+    pub bricks: u64,
+    /// The words of all bricks.
+    pub words: u64,
+}
+
+impl ChannelSize {
+    /// The bits per voxel of bricks that are not constant, entries included; 0 if there are none.
+    pub fn bits_per_voxel(&self) -> f64 {
+        match self.bricks {
+            0 => 0.0,
+            bricks => (self.words as f64 / bricks as f64 + ENTRY_WORDS) / 16.0,
+        }
+    }
 }
 
 /// Writes frames to a file.
@@ -69,7 +91,7 @@ pub struct Assembler<'c, W: Write + Seek> {
     /// The shapes of each channel.
     channel_shapes: Vec<Arc<Shapes>>,
     stored_words: u64,
-    source_bricks: u64,
+    channels: Vec<ChannelSize>,
 }
 
 impl<'c, W: Write + Seek> Assembler<'c, W> {
@@ -86,21 +108,23 @@ impl<'c, W: Write + Seek> Assembler<'c, W> {
     ) -> Result<Self, AssembleError> {
         let channel = |planned: &super::plan::ChannelPlan| {
             let (scale, peak) = (planned.scale(0.0), planned.peak());
+            let asked = options.for_channel(&planned.key.grid);
             ChannelInfo {
                 name: planned.key.grid.clone(),
                 component: planned.key.component,
                 role: planned.role,
-                physical_unit: String::new(),
+                physical_unit: asked.physical_unit.unwrap_or_default(),
                 unit: scale.unit,
                 floor: scale.floor,
                 peak,
                 quality: Quality::default(),
-                asked_max_error: options.max_error.map(|bound| bound.of(peak)),
-                asked_psnr: options.psnr,
+                asked_max_error: asked.max_error.map(|bound| bound.of(peak)),
+                asked_psnr: asked.psnr,
             }
         };
-        let channels = plan.channels.iter().map(channel).collect();
+        let channels: Vec<ChannelInfo> = plan.channels.iter().map(channel).collect();
         Ok(Assembler {
+            channels: vec![ChannelSize::default(); channels.len()],
             writer: Writer::new(out, compress)?,
             packer: Packer::default(),
             contents: Contents { frame_rate, channels, frames: Vec::new() },
@@ -108,7 +132,6 @@ impl<'c, W: Write + Seek> Assembler<'c, W> {
             shapes: HashMap::new(),
             channel_shapes: plan.channels.iter().map(|channel| Arc::clone(&channel.shapes)).collect(),
             stored_words: 0,
-            source_bricks: 0,
         })
     }
 
@@ -126,7 +149,9 @@ impl<'c, W: Write + Seek> Assembler<'c, W> {
         for grid in &frame.grids {
             let levels = grid.levels.iter().map(|level| self.add_level(level, grid));
             let levels = levels.collect::<Result<_, _>>()?;
-            self.source_bricks += grid.source_bricks;
+            let size = &mut self.channels[grid.channel];
+            size.bricks += grid.source_bricks;
+            size.words += grid.levels.first().map_or(0, |level| level.words.len() as u64);
             let quality = &mut self.contents.channels[grid.channel].quality;
             quality.max_error = quality.max_error.max(grid.quality.max_error);
             quality.squared_error += grid.quality.squared_error;
@@ -233,8 +258,9 @@ impl<'c, W: Write + Seek> Assembler<'c, W> {
             brick_bytes: 4 * self.stored_words,
             shape_bytes,
             entries: trees.entries.len() as u64,
-            source_bricks: self.source_bricks,
+            source_bricks: self.channels.iter().map(|size| size.bricks).sum(),
             bricks_stored: self.bricks.len() as u64,
+            channels: self.channels,
             contents: self.contents,
         })
     }

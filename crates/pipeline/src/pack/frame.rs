@@ -11,6 +11,8 @@ use nuage_volume::build::TileSize;
 use nuage_volume::codec::Codec;
 use nuage_volume::format::Quality;
 
+pub use super::options::{Bound, Options};
+
 use super::level::{Level, Tile};
 use super::plan::{ChannelPlan, ChannelTree, Plan, channel_trees};
 use crate::each;
@@ -18,56 +20,6 @@ use crate::encode::choose::{Candidate, Curve, Lambda, Target, Totals};
 use crate::encode::quantize::{Brick, CODECS, ChannelScale, Error, Measure, constant, write};
 use crate::encode::shapes::{SAMPLE_BRICKS, Shapes};
 use crate::import::linear_transform;
-
-/// How large an error may be.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Bound {
-    /// In the channel's own numbers.
-    Absolute(f32),
-    /// As a part of the channel's peak over all frames.
-    OfPeak(f32),
-}
-
-impl Bound {
-    /// The error in the numbers of a channel with this peak.
-    pub fn of(self, peak: f32) -> f32 {
-        match self {
-            Bound::Absolute(error) => error,
-            Bound::OfPeak(part) => part * peak,
-        }
-    }
-}
-
-/// What is asked of a packed volume.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Options {
-    /// The largest error of any voxel.
-    pub max_error: Option<Bound>,
-    /// The least ratio of a channel's peak to its error over all frames, in dB.
-    pub psnr: Option<f64>,
-    /// The most bits per voxel of bricks that are not constant, over all frames, entries included.
-    pub bits_per_voxel: Option<f64>,
-    /// One codec for all bricks that it can hold, whatever the error.
-    pub codec: Option<Codec>,
-    /// How many coarser levels are made at most.
-    pub coarser_levels: u32,
-    /// How many shapes the bricks of a channel may share at most. Finding them takes long, and only where large errors are
-    /// allowed do they save much.
-    pub shapes: u32,
-}
-
-impl Default for Options {
-    fn default() -> Self {
-        Options {
-            max_error: Some(Bound::OfPeak(0.03)),
-            psnr: Some(45.0),
-            bits_per_voxel: None,
-            codec: None,
-            coarser_levels: 0,
-            shapes: 0,
-        }
-    }
-}
 
 /// A frame that is encoded.
 #[derive(Debug, Clone, Default)]
@@ -234,6 +186,7 @@ struct Choice {
 
 impl Choice {
     fn new(planned: &ChannelPlan, options: &Options, lambda: Lambda) -> Choice {
+        let options = options.for_channel(&planned.key.grid);
         let shapes = Arc::clone(&planned.shapes);
         match options.codec {
             // A codec that is asked for is not weighed against others; what it cannot hold takes more.
@@ -271,10 +224,11 @@ impl Choice {
 
 /// The words that the tree takes for a brick: an entry of two, and its part of nodes, masks and entries that are no
 /// bricks.
-const ENTRY_WORDS: f64 = 3.0;
+pub(super) const ENTRY_WORDS: f64 = 3.0;
 
 /// What a channel's bricks have to keep to, over all frames, squared errors in its unit.
 fn target(planned: &ChannelPlan, options: &Options) -> Target {
+    let options = options.for_channel(&planned.key.grid);
     let scale = planned.scale(0.0);
     let peak = f64::from(planned.peak() / scale.unit);
     Target {
@@ -294,10 +248,11 @@ pub fn settle(totals: &Totals, planned: &ChannelPlan, options: &Options) -> Lamb
 
 /// Finds the shapes of each channel, in bricks of some frames of the sequence. A codec that is asked for has none.
 pub fn find_shapes(frames: &[&[Grid]], plan: &mut Plan, options: &Options) {
-    if options.codec.is_some() || options.shapes == 0 {
-        return;
-    }
     for planned in &mut plan.channels {
+        let asked = options.for_channel(&planned.key.grid);
+        if asked.codec.is_some() || options.shapes == 0 {
+            continue;
+        }
         let trees = frames.iter().flat_map(|grids| channel_trees(grids).0);
         let levels: Vec<Level> = trees
             .filter(|tree| tree.key == planned.key)
@@ -307,7 +262,7 @@ pub fn find_shapes(frames: &[&[Grid]], plan: &mut Plan, options: &Options) {
         let every = count.div_ceil(SAMPLE_BRICKS).max(1);
         let bricks = levels.iter().flat_map(|level| &level.bricks).step_by(every).copied();
         let bricks: Vec<Brick> = bricks.collect();
-        let bound = options.max_error.map_or(f32::INFINITY, |bound| bound.of(planned.peak()));
+        let bound = asked.max_error.map_or(f32::INFINITY, |bound| bound.of(planned.peak()));
         // Bricks that are like others may take some times their share of the error, as it saves so much.
         let share = target(planned, options)
             .squared_error

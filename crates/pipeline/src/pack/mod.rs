@@ -3,7 +3,8 @@
 //! Packing goes through a sequence up to three times. [`plan`] notes the range of each channel over all frames;
 //! [`frame`] weighs what errors cost, where a ratio or a size is asked for, and then encodes each frame on its own;
 //! [`assemble`] puts frames one after the other into a file, where what they have in common stands once. [`sequence`]
-//! does one after the other. [`level`] makes the coarser levels of a tree, [`unpack`] makes grids of a packed frame again.
+//! does one after the other. [`options`] is what is asked of it, [`level`] makes the coarser levels of a tree, [`unpack`]
+//! makes grids of a packed frame again.
 //!
 //! A grid becomes a channel, a vector grid three. Values keep their meaning: a level set stays one. What does not
 //! fit (points, strings, trees of other shapes) is named in a warning and left out. Which codec a brick gets is
@@ -12,6 +13,7 @@
 pub mod assemble;
 pub mod frame;
 pub mod level;
+pub mod options;
 pub mod plan;
 pub mod sequence;
 pub mod unpack;

@@ -10,8 +10,9 @@ use nuage_vdb::{Grid, Metadata};
 
 use super::assemble::{AssembleError, Assembler, Report};
 use super::frame::{
-    EncodeError, EncodedFrame, Options, WeighedChannel, encode_frame, find_shapes, settle, weigh_frame,
+    EncodeError, EncodedFrame, WeighedChannel, encode_frame, find_shapes, settle, weigh_frame,
 };
+use super::options::{NoSuchChannel, Options};
 use super::plan::Plan;
 use crate::each;
 use crate::encode::choose::Totals;
@@ -34,6 +35,9 @@ pub enum PackError<E> {
     /// A frame cannot be loaded.
     #[error("{0}")]
     Load(E),
+    /// Something is asked of a channel that is in no frame.
+    #[error(transparent)]
+    Channel(#[from] NoSuchChannel),
     /// A frame cannot be encoded.
     #[error(transparent)]
     Encode(#[from] EncodeError),
@@ -46,7 +50,7 @@ pub enum PackError<E> {
 /// any of the passes, as a part of the whole.
 ///
 /// # Errors
-/// If a frame cannot be loaded or encoded, or the file not written.
+/// If a frame cannot be loaded or encoded, a channel that is asked for by name is in none, or the file cannot be written.
 pub fn pack<E: Send, W: Write + Seek>(
     frames: &[FrameName],
     load: impl Fn(usize) -> Result<Loaded, E> + Sync,
@@ -55,7 +59,7 @@ pub fn pack<E: Send, W: Write + Seek>(
     frame_rate: Option<f64>,
     done: &mut dyn FnMut(f64),
 ) -> Result<(Report, Plan), PackError<E>> {
-    let is_weighed = options.codec.is_none() && (options.psnr.is_some() || options.bits_per_voxel.is_some());
+    let is_weighed = options.is_weighed();
     let passes = if is_weighed { 3 } else { 2 };
     let mut finished = 0;
     let mut tell = |count: usize| {
@@ -89,6 +93,7 @@ pub fn pack<E: Send, W: Write + Seek>(
         }
         tell(window.len());
     }
+    options.apply(&mut plan)?;
     // Shapes are found in what is at hand: all frames, or the first of a long sequence.
     let samples: Vec<&[Grid]> =
         kept.iter().filter_map(|kept| Some(kept.loaded.as_ref()?.0.as_slice())).collect();

@@ -33,6 +33,8 @@ fn compare(a: &Tree<f32>, b: &Tree<f32>) -> VoxelDifference {
 /// What comparing voxel by voxel over the whole of the part of space that [`tree`] fills gives.
 fn compare_slowly(a: &Tree<f32>, b: &Tree<f32>) -> VoxelDifference {
     let mut found = VoxelDifference::default();
+    let errors = &mut found.components[0];
+    errors.peak = f64::from(a.background.abs());
     for x in -16..16 {
         for y in -16..16 {
             for z in -16..16 {
@@ -43,12 +45,19 @@ fn compare_slowly(a: &Tree<f32>, b: &Tree<f32>) -> VoxelDifference {
                 found.differing_values += u64::from(active && error > 0.0);
                 found.differing_inactive_values += u64::from(!active && error > 0.0);
                 found.differing_states += u64::from(p.active != q.active);
-                found.max_error = found.max_error.max(error);
+                if error > errors.max {
+                    errors.max = error;
+                    errors.max_values = [p.value, q.value].map(f64::from);
+                }
+                errors.sign_changes += u64::from((p.value < 0.0) != (q.value < 0.0));
                 if p.value != a.background {
-                    found.compared += 1;
-                    found.sum_of_errors += error;
-                    found.sum_of_squares += error * error;
-                    found.peak = found.peak.max(f64::from(p.value.abs()));
+                    errors.compared += 1;
+                    errors.sum += error;
+                    errors.squares += error * error;
+                    errors.peak = errors.peak.max(f64::from(p.value.abs()));
+                } else {
+                    errors.background_squares += error * error;
+                    errors.fog = errors.fog.max(error);
                 }
             }
         }
@@ -64,7 +73,8 @@ proptest! {
         let found = compare(&tree, &tree);
         prop_assert!(found.is_equal());
         prop_assert_eq!(found.active, tree.active_voxel_count());
-        prop_assert_eq!((found.max_error, found.max_error_at, found.psnr()), (0.0, None, f64::INFINITY));
+        let errors = found.errors();
+        prop_assert_eq!((errors.max, errors.max_at, errors.psnr()), (0.0, None, f64::INFINITY));
         prop_assert_eq!((found.nodes_only_in_a, found.nodes_only_in_b), (0, 0));
     }
 
@@ -81,7 +91,12 @@ proptest! {
         let found = compare(&tree, &changed);
         let active = tree.voxel(ijk).active;
         prop_assert_eq!([found.differing_values, found.differing_inactive_values], if active { [1, 0] } else { [0, 1] });
-        prop_assert_eq!((found.max_error, found.max_error_at), (f64::from(change), Some(ijk)));
+        let errors = found.errors();
+        prop_assert_eq!((errors.max, errors.max_at), (f64::from(change), Some(ijk)));
+        let before = tree.voxel(ijk).value;
+        prop_assert_eq!(errors.max_values, [before, before + f32::from(change)].map(f64::from));
+        let is_fog = before == tree.background;
+        prop_assert_eq!((errors.fog, errors.fog_at), if is_fog { (errors.max, Some(ijk)) } else { (0.0, None) });
         prop_assert_eq!(&found.first, &vec![ijk]);
         let tolerance = f64::from(change);
         let tolerant = Options { tolerance, ..Options::default() };
@@ -102,11 +117,17 @@ proptest! {
         prop_assert_eq!(fast.differing_values, slow.differing_values);
         prop_assert_eq!(fast.differing_inactive_values, slow.differing_inactive_values);
         prop_assert_eq!(fast.differing_states, slow.differing_states);
-        prop_assert_eq!(fast.max_error, slow.max_error);
-        prop_assert_eq!(fast.sum_of_errors, slow.sum_of_errors);
-        prop_assert_eq!(fast.sum_of_squares, slow.sum_of_squares);
-        prop_assert_eq!(fast.peak, slow.peak);
         prop_assert_eq!(fast.is_equal(), slow.is_equal());
+        // The worst voxel is the first in the order of the tree, which is not that of coordinates.
+        let errors = fast.errors();
+        prop_assert_eq!(errors.max_at.is_some(), errors.max > 0.0);
+        prop_assert_eq!(errors.fog_at.is_some(), errors.fog > 0.0);
+        if let Some(at) = errors.max_at {
+            prop_assert_eq!([&a, &b].map(|tree| f64::from(tree.voxel(at).value)), errors.max_values);
+        }
+        let places = (errors.max_at, errors.max_values, errors.fog_at);
+        let expected = Errors { max_at: places.0, max_values: places.1, fog_at: places.2, ..slow.errors() };
+        prop_assert_eq!(errors, expected);
     }
 }
 
@@ -135,9 +156,16 @@ fn large_tiles_are_compared_as_a_whole() {
     };
     let found = compare(&with_tile(1.0), &with_tile(1.5));
     assert_eq!((found.active, found.differing_values), (1 << 36, 1 << 36));
-    assert_eq!((found.max_error, found.max_error_at), (0.5, Some([-4096, 0, 0])));
-    assert_eq!((found.mean_error(), found.rms_error()), (0.5, 0.5));
-    assert!((found.psnr() - 20.0 * 2.0_f64.log10()).abs() < 1e-12);
+    let errors = found.errors();
+    assert_eq!((errors.max, errors.max_at, errors.max_values), (0.5, Some([-4096, 0, 0]), [1.0, 1.5]));
+    assert_eq!((errors.mean(), errors.rms()), (0.5, 0.5));
+    assert!((errors.psnr() - 20.0 * 2.0_f64.log10()).abs() < 1e-12);
+    let mut both = found.clone();
+    both.merge(compare(&with_tile(4.0), &with_tile(-0.5)), 10);
+    let errors = both.errors();
+    assert_eq!((errors.max, errors.max_values, errors.peak), (4.5, [4.0, -0.5], 4.0));
+    assert_eq!((errors.compared, errors.sign_changes), (1 << 37, 1 << 36));
+    assert_eq!(errors.rms(), ((0.25 + 20.25) / 2.0_f64).sqrt());
 }
 
 fn grid_of<V: Value>(value: V) -> Grid
@@ -156,13 +184,18 @@ fn numbers_of_different_types_are_compared_as_numbers() {
     let same = grids(&grid_of(0.5_f32), &grid_of(0.5_f64), &exact);
     assert!(same.has_equal_voxels() && !same.is_equal());
     assert_eq!(same.disagreements[0].what, "type");
-    assert_eq!(voxels(&grid_of(2_i32), &grid_of(2.5_f32)).unwrap().max_error, 0.5);
+    assert_eq!(voxels(&grid_of(2_i32), &grid_of(2.5_f32)).unwrap().errors().max, 0.5);
     assert!(voxels(&grid_of(1_i32), &grid_of([1_i32; 3])).is_none());
     let big = 1_i64 << 60;
-    assert_eq!(voxels(&grid_of(big), &grid_of(big + 1)).unwrap().max_error, 1.0);
+    assert_eq!(voxels(&grid_of(big), &grid_of(big + 1)).unwrap().errors().max, 1.0);
     assert!(voxels(&grid_of(7_i64), &grid_of(7_i32)).unwrap().is_equal());
     let found = voxels(&grid_of([1.0_f32, 2.0, 3.0]), &grid_of([1.0_f64, 2.0, 4.0])).unwrap();
-    assert_eq!((found.max_error, found.mean_error(), found.peak), (1.0, 1.0 / 3.0, 3.0));
+    let errors = found.errors();
+    assert_eq!((errors.max, errors.mean(), errors.peak), (1.0, 1.0 / 3.0, 3.0));
+    assert_eq!(
+        found.components.map(|errors| (errors.max, errors.peak)),
+        [(0.0, 1.0), (0.0, 2.0), (1.0, 3.0)]
+    );
 }
 
 #[test]
@@ -174,7 +207,7 @@ fn not_a_number_equals_itself_and_nothing_else() {
     }
     for (a, b) in [(&nan, &inf), (&inf, &nan), (&grid_of(1.0_f32), &nan), (&grid_of(-f32::INFINITY), &inf)] {
         let found = grids(a, b, &options).voxels.unwrap();
-        assert_eq!((found.not_finite, found.is_equal(), found.compared), (512, false, 0));
+        assert_eq!((found.not_finite, found.is_equal(), found.errors().compared), (512, false, 0));
     }
 }
 

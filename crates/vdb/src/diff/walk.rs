@@ -48,6 +48,10 @@ pub(super) fn compare<V: Value>(a: &Tree<V>, b: &Tree<V>, options: &Options) -> 
         walk.plan(Task { level: 0, origin, a: part_a, b: part_b });
     }
     walk.run();
+    for (i, errors) in walk.total.components.iter_mut().enumerate().take(V::COMPONENTS) {
+        let background = a.background.component(i).abs();
+        errors.peak = errors.peak.max(if background.is_finite() { background } else { 0.0 });
+    }
     walk.total
 }
 
@@ -119,7 +123,7 @@ impl<V: Value> Walk<'_, V> {
         #[cfg(not(feature = "parallel"))]
         let all = tasks.iter().map(one);
         for found in all {
-            add(&mut self.total, found, self.options.listed);
+            self.total.merge(found, self.options.listed);
         }
     }
 
@@ -210,13 +214,9 @@ fn compare_values<V: Value>(
         return;
     }
     let add_to = |count: &mut u64| *count = count.saturating_add(voxels);
-    let (mut largest, mut sum, mut squares) = (0.0_f64, 0.0, 0.0);
-    for i in 0..V::COMPONENTS {
-        let error = component_error(x, y, i);
-        largest = largest.max(error);
-        sum += error;
-        squares += error * error;
-    }
+    let errors: [f64; 3] =
+        std::array::from_fn(|i| if i < V::COMPONENTS { component_error(x, y, i) } else { 0.0 });
+    let largest = errors.into_iter().fold(0.0, f64::max);
     if largest > options.tolerance {
         add_to(if active { &mut found.differing_values } else { &mut found.differing_inactive_values });
     }
@@ -226,45 +226,34 @@ fn compare_values<V: Value>(
     if (largest > options.tolerance || x_on != y_on) && found.first.len() < options.listed {
         found.first.push(ijk);
     }
-    if !largest.is_finite() {
-        add_to(&mut found.not_finite);
-    } else if largest > found.max_error {
-        found.max_error = largest;
-        found.max_error_at = Some(ijk);
-    }
     if active {
         add_to(&mut found.active);
     }
-    if !is_stored {
-        return;
+    if !largest.is_finite() {
+        add_to(&mut found.not_finite);
     }
-    if largest.is_finite() {
-        found.compared = found.compared.saturating_add(voxels.saturating_mul(V::COMPONENTS as u64));
-        found.sum_of_errors += sum * voxels as f64;
-        found.sum_of_squares += squares * voxels as f64;
+    for (i, total) in found.components.iter_mut().enumerate().take(V::COMPONENTS) {
+        let (x, y, error) = (x.component(i), y.component(i), errors[i]);
+        if (x < 0.0) != (y < 0.0) {
+            add_to(&mut total.sign_changes);
+        }
+        if error > total.max && error.is_finite() {
+            (total.max, total.max_at, total.max_values) = (error, Some(ijk), [x, y]);
+        }
+        if !is_stored {
+            if error > total.fog && error.is_finite() {
+                (total.fog, total.fog_at) = (error, Some(ijk));
+            }
+            if largest.is_finite() {
+                total.background_squares += error * error * voxels as f64;
+            }
+            continue;
+        }
+        if largest.is_finite() {
+            add_to(&mut total.compared);
+            total.sum += error * voxels as f64;
+            total.squares += error * error * voxels as f64;
+        }
+        total.peak = total.peak.max(if x.is_finite() { x.abs() } else { 0.0 });
     }
-    let sizes = (0..V::COMPONENTS).map(|i| x.component(i).abs()).filter(|size| size.is_finite());
-    found.peak = sizes.fold(found.peak, f64::max);
-}
-
-/// Adds what was found in a later region.
-fn add(total: &mut VoxelDifference, found: VoxelDifference, listed: usize) {
-    let plus = |count: &mut u64, more: u64| *count = count.saturating_add(more);
-    plus(&mut total.active, found.active);
-    plus(&mut total.differing_values, found.differing_values);
-    plus(&mut total.differing_inactive_values, found.differing_inactive_values);
-    plus(&mut total.differing_states, found.differing_states);
-    plus(&mut total.not_finite, found.not_finite);
-    plus(&mut total.compared, found.compared);
-    plus(&mut total.nodes_only_in_a, found.nodes_only_in_a);
-    plus(&mut total.nodes_only_in_b, found.nodes_only_in_b);
-    if found.max_error > total.max_error {
-        total.max_error = found.max_error;
-        total.max_error_at = found.max_error_at;
-    }
-    total.sum_of_errors += found.sum_of_errors;
-    total.sum_of_squares += found.sum_of_squares;
-    total.peak = total.peak.max(found.peak);
-    total.first.extend(found.first);
-    total.first.truncate(listed);
 }

@@ -84,6 +84,20 @@ pub struct Quality {
     pub voxels: u64,
 }
 
+impl Quality {
+    /// The ratio of a channel's peak to its error in decibels, `10·log10(peak² / mean squared error)`; infinite if there
+    /// is no error.
+    pub fn psnr(&self, peak: f32) -> f64 {
+        match self.squared_error > 0.0 {
+            true => {
+                let mean = self.squared_error / self.voxels.max(1) as f64;
+                10.0 * (f64::from(peak).powi(2) / mean).log10()
+            }
+            false => f64::INFINITY,
+        }
+    }
+}
+
 /// A moment.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Frame {
