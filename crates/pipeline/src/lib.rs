@@ -12,6 +12,7 @@
 
 pub mod cluster;
 pub mod encode;
+pub mod eval;
 pub mod import;
 #[cfg(feature = "fs")]
 pub mod output;
