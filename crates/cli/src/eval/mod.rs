@@ -101,7 +101,8 @@ fn csv_files(args: &Args) -> Vec<(PathBuf, Option<Wanted>)> {
             vec![(path.clone(), None)]
         }
         Some(folder) => {
-            let wanted = all.into_iter().filter(|table| args.tables.is_empty() || args.tables.contains(table));
+            let wanted =
+                all.into_iter().filter(|table| args.tables.is_empty() || args.tables.contains(table));
             wanted.map(|table| (folder.join(format!("{}.csv", table.name())), Some(table))).collect()
         }
     }

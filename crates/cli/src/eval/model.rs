@@ -47,7 +47,8 @@ impl Model {
 /// Names for files: their own, and the folder's where two have the same.
 pub(crate) fn names(paths: &[PathBuf]) -> Vec<String> {
     let last = |path: &Path| {
-        path.file_name().map_or_else(|| path.display().to_string(), |name| name.to_string_lossy().into_owned())
+        path.file_name()
+            .map_or_else(|| path.display().to_string(), |name| name.to_string_lossy().into_owned())
     };
     let name = |path: &PathBuf| {
         let own = last(path);
@@ -74,7 +75,10 @@ pub(crate) fn channels(
     let mut count = 0;
     for (index, info) in file.grids.iter().enumerate().filter(|(_, info)| is_drawable(info)) {
         let mut grid = file.read_grid(index).map_err(|error| Failure::file(path, explain(&error)))?;
-        let taken = std::mem::replace(&mut grid.tree, Arc::new(Tree::empty(0.0_f32, nuage_vdb::Shape::STANDARD).into()));
+        let taken = std::mem::replace(
+            &mut grid.tree,
+            Arc::new(Tree::empty(0.0_f32, nuage_vdb::Shape::STANDARD).into()),
+        );
         let tree = Arc::try_unwrap(taken).unwrap_or_else(|shared| (*shared).clone());
         // As a name to find the channel by later; those of a file may be alike.
         grid.name.clone_from(&info.unique_name);

@@ -80,7 +80,12 @@ impl<'w> Tables<'w> {
                 CLUSTERS_NOTE,
                 CLUSTERS_COLUMNS,
             ),
-            topology: table(Wanted::Topology, "Node sizes (thesis, section 7.2)", TOPOLOGY_NOTE, TOPOLOGY_COLUMNS),
+            topology: table(
+                Wanted::Topology,
+                "Node sizes (thesis, section 7.2)",
+                TOPOLOGY_NOTE,
+                TOPOLOGY_COLUMNS,
+            ),
         }
     }
 
@@ -230,11 +235,16 @@ const FORMATS_COLUMNS: &[[&str; 2]] = &[
 
 /// What is asked of our own formats, and their names.
 fn ours() -> [(&'static str, Options); 3] {
-    let bits = |bits| Options { max_error: None, psnr: None, bits_per_voxel: Some(bits), ..Options::default() };
+    let bits =
+        |bits| Options { max_error: None, psnr: None, bits_per_voxel: Some(bits), ..Options::default() };
     [("nuage default", Options::default()), ("nuage 4 bits", bits(4.0)), ("nuage 2 bits", bits(2.0))]
 }
 
-fn format_rows(model: &Model, topology: &Topology, studio: &mut Studio<'_>) -> Result<Vec<Vec<Cell>>, String> {
+fn format_rows(
+    model: &Model,
+    topology: &Topology,
+    studio: &mut Studio<'_>,
+) -> Result<Vec<Vec<Cell>>, String> {
     let source = bricks(model.tree());
     let range = scheme::range(source);
     let voxels = (source.len() * BRICK_VOXELS) as f64;
@@ -309,18 +319,27 @@ fn cluster_rows(model: &Model, studio: &mut Studio<'_>) -> Result<Vec<Vec<Cell>>
     // Each brick is encoded once, whatever it is replaced by.
     let kept = stored(source, BC7, range);
     let mut rows = Vec::new();
-    let mut add = |first: [Cell; 4], after: usize, extra_bytes: usize, read: Vec<Brick>| -> Result<(), String> {
-        let grid = model.with_tree(with_bricks(model.tree(), read));
-        let before = source.len();
-        let bytes = after * BC7.brick_bytes() + extra_bytes;
-        let bits = 8.0 * bytes as f64 / (before * BRICK_VOXELS) as f64;
-        let decibels = voxel_difference(model, &grid)?.psnr();
-        let [rmse, of_max] = picture_cells(studio.compare(grid)?);
-        let ratio = Cell::Fixed(after as f64 / before as f64, 5);
-        let rest = [before.into(), after.into(), ratio, Cell::Fixed(bits, 3), Cell::Fixed(decibels, 1), rmse, of_max];
-        rows.push(first.into_iter().chain(rest).collect());
-        Ok(())
-    };
+    let mut add =
+        |first: [Cell; 4], after: usize, extra_bytes: usize, read: Vec<Brick>| -> Result<(), String> {
+            let grid = model.with_tree(with_bricks(model.tree(), read));
+            let before = source.len();
+            let bytes = after * BC7.brick_bytes() + extra_bytes;
+            let bits = 8.0 * bytes as f64 / (before * BRICK_VOXELS) as f64;
+            let decibels = voxel_difference(model, &grid)?.psnr();
+            let [rmse, of_max] = picture_cells(studio.compare(grid)?);
+            let ratio = Cell::Fixed(after as f64 / before as f64, 5);
+            let rest = [
+                before.into(),
+                after.into(),
+                ratio,
+                Cell::Fixed(bits, 3),
+                Cell::Fixed(decibels, 1),
+                rmse,
+                of_max,
+            ];
+            rows.push(first.into_iter().chain(rest).collect());
+            Ok(())
+        };
     add(["none".into(), Cell::None, Cell::None, Cell::None], source.len(), 0, kept.clone())?;
     for (name, rejection) in
         [("normalised", Rejection::NormalizedVariance), ("over mean", Rejection::VarianceOverMean)]
@@ -330,8 +349,12 @@ fn cluster_rows(model: &Model, studio: &mut Studio<'_>) -> Result<Vec<Vec<Cell>>
             let mut found = thesis::cluster(source, &settings);
             found.centres = stored(&found.centres, BC7, range);
             let after = found.centres.len() + found.of_brick.iter().filter(|of| of.is_none()).count();
-            let first =
-                [name.into(), clusters.into(), (iterations as usize).into(), Cell::Text(number(threshold.into()))];
+            let first = [
+                name.into(),
+                clusters.into(),
+                (iterations as usize).into(),
+                Cell::Text(number(threshold.into())),
+            ];
             add(first, after, 0, scheme::clustered(&kept, &found))?;
         }
     }

@@ -92,9 +92,7 @@ pub fn stored(bricks: &[Brick], format: Format, range: [f32; 2]) -> Vec<Brick> {
     let unorm = |value: f32| fraction(((f64::from(value) - min) / width) as f32);
     let value = |unorm: f32| (min + width * f64::from(unorm)) as f32;
     match format {
-        Format::F16 => {
-            bricks.iter().map(|brick| brick.map(|value| f16::from_f32(value).to_f32())).collect()
-        }
+        Format::F16 => bricks.iter().map(|brick| brick.map(|value| f16::from_f32(value).to_f32())).collect(),
         Format::Unorm8 => {
             let byte = |value: f32| (unorm(value) * 255.0).round() / 255.0;
             bricks.iter().map(|brick| brick.map(|v| value(byte(v)))).collect()

@@ -147,7 +147,14 @@ impl Topology {
             false => [to_voxels(first), to_voxels(last) + (1 << LOG2_BRICK)],
         };
         let cells = paths.into_iter().map(|(cell, _)| cell).collect();
-        Some(Topology { offset: offset << LOG2_BRICK, voxels, cells, levels, log2_brick: *log2_brick, bricks: brick_count })
+        Some(Topology {
+            offset: offset << LOG2_BRICK,
+            voxels,
+            cells,
+            levels,
+            log2_brick: *log2_brick,
+            bricks: brick_count,
+        })
     }
 
     /// How many nodes each level has, the root's children first.
@@ -257,8 +264,11 @@ impl Topology {
         };
         let log2 = level.log2_width;
         let words = &level.words[node * level.words_per_node..][..level.words_per_node];
-        let last = IVec3::splat((1 << log2) - 1);
-        ray.cells(first, [IVec3::ZERO, last], level.log2_child, span, &mut |cell, span| {
+        // The ray enters and leaves at the box, which is in the middle of nodes: rounding must not take it across.
+        let to_cell = |voxel: IVec3| (voxel - first) >> level.log2_child as i32;
+        let low = to_cell(self.voxels[0]).max(IVec3::ZERO);
+        let high = to_cell(self.voxels[1] - 1).min(IVec3::splat((1 << log2) - 1));
+        ray.cells(first, [low, high], level.log2_child, span, &mut |cell, span| {
             visits.cells += 1;
             let slot = (cell.x << (2 * log2) | cell.y << log2 | cell.z) as usize;
             let (word, bit) = (words[slot / 32], 1_u32 << (slot % 32));
