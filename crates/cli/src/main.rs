@@ -8,6 +8,7 @@ mod convert;
 mod demo;
 mod diff;
 mod error;
+mod eval;
 mod frames;
 mod grid;
 mod info;
@@ -53,6 +54,7 @@ enum Command {
     Validate(validate::Args),
     Convert(Box<convert::Args>),
     Texture(texture::Args),
+    Eval(eval::Args),
 }
 
 fn main() -> ExitCode {
@@ -65,6 +67,7 @@ fn main() -> ExitCode {
         Command::Validate(args) => validate::run(&args),
         Command::Convert(args) => convert::run(&args),
         Command::Texture(args) => texture::run(&args),
+        Command::Eval(args) => eval::run(&args),
     };
     match outcome {
         Ok(()) => ExitCode::SUCCESS,

@@ -148,6 +148,11 @@ impl<'l> Shot<'l> {
         look.density == Auto::Auto || (look.emission == Auto::Auto && glows)
     }
 
+    /// The view.
+    pub(crate) fn camera(&self) -> Camera {
+        self.camera
+    }
+
     /// Camera and scales in words, so that the shot can be repeated.
     pub(crate) fn describe(&self) -> String {
         let Camera { origin, forward, .. } = self.camera;

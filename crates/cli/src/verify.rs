@@ -122,7 +122,8 @@ fn compare_frame(
             return Err(format!("grid '{name}': its transform is another"));
         }
         let is_half = matches!(&*grid.tree, AnyTree::Half(_));
-        let difference = diff::trees(&source.tree.into_owned().into(), &back.tree.into_owned().into(), &options);
+        let difference =
+            diff::trees(&source.tree.into_owned().into(), &back.tree.into_owned().into(), &options);
         let (Some(difference), Some(found)) = (difference, found.get_mut(*channel)) else {
             return Err(format!("grid '{name}' cannot be compared"));
         };

@@ -2,8 +2,9 @@
 //!
 //! [`import`] turns a decoded grid into a channel of the packed volume; [`select`] finds the grid that a user
 //! means; [`encode`] puts bricks into fewer bytes, [`cluster`] finds those that can share their values, and [`pack`]
-//! makes packed volumes of frames; [`texture`] lays bricks out as a 3D texture for engines of others; with the feature
-//! `fs`, [`sequence`] turns `smoke.####.vdb` into frames and [`output`] writes files that appear whole or not at all.
+//! makes packed volumes of frames; [`eval`] has what they are held against; [`texture`] lays bricks out as a 3D texture
+//! for engines of others; with the feature `fs`, [`sequence`] turns `smoke.####.vdb` into frames and [`output`] writes
+//! files that appear whole or not at all.
 //!
 //! What does not live here: decoding of .vdb bytes (crate `nuage-vdb`), the volume itself (`nuage-volume`),
 //! lights, cameras and pictures (`nuage-render`).
@@ -12,6 +13,7 @@
 
 pub mod cluster;
 pub mod encode;
+pub mod eval;
 pub mod import;
 #[cfg(feature = "fs")]
 pub mod output;

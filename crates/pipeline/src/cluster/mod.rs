@@ -71,7 +71,7 @@ fn choose(from: &[usize], count: usize, seed: u64) -> Vec<usize> {
 
 /// What `make` gives for 0 to `count`, in this order, in parallel where the feature is on. Each thread has
 /// working memory of its own.
-fn map<S, T: Send>(
+pub(crate) fn map<S, T: Send>(
     count: usize,
     memory: impl Fn() -> S + Sync + Send,
     make: impl Fn(&mut S, usize) -> T + Sync + Send,

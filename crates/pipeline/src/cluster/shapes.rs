@@ -351,7 +351,7 @@ fn nearest_lines(
                     best = (line, along);
                 }
             }
-            (energy - best.1.powi(2) <= 2.0 * target).then_some(best)
+            (!spectra.is_empty() && energy - best.1.powi(2) <= 2.0 * target).then_some(best)
         },
     )
 }

@@ -174,6 +174,17 @@ fn scaled_copies_share_one_shape() {
 }
 
 #[test]
+fn bricks_of_which_none_describes_another_share_what_is_flat() {
+    let wave = |shift: usize| -> Brick {
+        std::array::from_fn(|voxel| 0.1732 * (PI * ((voxel >> shift & 7) as f32 + 0.5) / 8.0).cos())
+    };
+    let bricks = [wave(6), wave(3), wave(0)];
+    let found = shapes::share(&bricks, &shape_settings(10, 0.5));
+    assert_eq!(found.shapes.len(), 1);
+    assert!(found.of_brick.iter().all(Option::is_some));
+}
+
+#[test]
 fn threads_and_repetition_change_nothing() {
     let bricks = smoke(1500, 2);
     let run = || {
