@@ -10,7 +10,10 @@ use std::sync::LazyLock;
 
 use fearless_simd::{Level, Simd, dispatch};
 use half::f16;
-use nuage_volume::codec::{BrickContext, Codec, Line, codes, interpolate_corners, octant_lines};
+use nuage_volume::codec::{
+    BrickContext, Codec, LATTICE_POINTS, Line, codes, interpolate_corners, interpolate_lattice, lattice_cell,
+    octant_lines,
+};
 use nuage_volume::space::BRICK_VOXELS;
 
 use super::block;
@@ -44,26 +47,32 @@ pub struct Error {
 }
 
 /// The codecs that are tried unless one is asked for, the cheapest first.
-pub const CODECS: [Codec; 25] = [
+pub const CODECS: [Codec; 31] = [
     Codec::Constant,
     Codec::Gradient { bits: 0 },
     Codec::Shared,
     Codec::Uniform { bits: 1 },
+    Codec::Lattice { bits: 0 },
     Codec::Gradient { bits: 1 },
     Codec::Split { bits: 1 },
     Codec::Uniform { bits: 2 },
+    Codec::Lattice { bits: 1 },
     Codec::Gradient { bits: 2 },
     Codec::Split { bits: 2 },
     Codec::Uniform { bits: 3 },
+    Codec::Lattice { bits: 2 },
     Codec::Gradient { bits: 3 },
     Codec::Split { bits: 3 },
     Codec::Uniform { bits: 4 },
+    Codec::Lattice { bits: 3 },
     Codec::Gradient { bits: 4 },
     Codec::Split { bits: 4 },
     Codec::Uniform { bits: 5 },
+    Codec::Lattice { bits: 4 },
     Codec::Gradient { bits: 5 },
     Codec::Split { bits: 5 },
     Codec::Uniform { bits: 6 },
+    Codec::Lattice { bits: 5 },
     Codec::Gradient { bits: 6 },
     Codec::Gradient { bits: 7 },
     Codec::Uniform { bits: 8 },
@@ -79,20 +88,22 @@ pub struct Measure<'a> {
     shapes: &'a Shapes,
     range: Range,
     /// The fitted gradient and the range of what it leaves over, once a codec has asked for it.
-    gradient: Option<(Gradient, Range)>,
+    gradient: Option<(Prediction<8>, Range)>,
+    /// The fitted lattice likewise.
+    lattice: Option<(Prediction<LATTICE_POINTS>, Range)>,
 }
 
 impl<'a> Measure<'a> {
     /// Begins with a brick. `shapes` are those that it may share.
     pub fn of(values: &'a Brick, scale: &'a ChannelScale, shapes: &'a Shapes) -> Self {
         let range = Range::of_residuals(values, &NOTHING, scale);
-        Measure { values, scale, shapes, range, gradient: None }
+        Measure { values, scale, shapes, range, gradient: None, lattice: None }
     }
 
     /// The error in a codec, `None` where it cannot hold the brick: empty voxels would not stay empty, a sign would
     /// change, or no shape is like it. [`Codec::F32`] always can.
     pub fn error(&mut self, codec: Codec) -> Option<Error> {
-        let Measure { values, scale, shapes, range, ref mut gradient } = *self;
+        let Measure { values, scale, shapes, range, ref mut gradient, ref mut lattice } = *self;
         match codec {
             Codec::Constant => {
                 let line = Line { low: constant(values, scale), step: 0.0 };
@@ -102,16 +113,14 @@ impl<'a> Measure<'a> {
                 quantized_error(values, &NOTHING, &[range.line(bits, scale).line; 8], bits, scale)
             }
             Codec::Gradient { bits } => {
-                let (gradient, residuals) = gradient.get_or_insert_with(|| {
-                    let gradient = Gradient::fit(values, scale);
-                    let residuals = Range::of_residuals(values, &gradient.predicted, scale);
-                    (gradient, residuals)
-                });
-                let line = match bits {
-                    0 => Line::default(),
-                    bits => residuals.line(bits, scale).line,
-                };
-                quantized_error(values, &gradient.predicted, &[line; 8], bits, scale)
+                let (gradient, residuals) =
+                    gradient.get_or_insert_with(|| Prediction::gradient(values, scale).ranged(values, scale));
+                gradient.error(*residuals, values, bits, scale)
+            }
+            Codec::Lattice { bits } => {
+                let (lattice, residuals) =
+                    lattice.get_or_insert_with(|| Prediction::lattice(values, scale).ranged(values, scale));
+                lattice.error(*residuals, values, bits, scale)
             }
             Codec::Split { bits } => {
                 quantized_error(values, &NOTHING, &Split::over(values, scale, bits).lines, bits, scale)
@@ -163,20 +172,8 @@ pub fn write(values: &Brick, codec: Codec, scale: &ChannelScale, shapes: &Shapes
             words.push(line.word);
             codes::pack(bits, &quantize(values, &NOTHING, &[line.line; 8], bits, scale), words);
         }
-        Codec::Gradient { bits } => {
-            let gradient = Gradient::fit(values, scale);
-            words.push(gradient.line.word);
-            words.extend(gradient.codes.as_chunks::<4>().0.iter().map(|codes| u32::from_le_bytes(*codes)));
-            if bits > 0 {
-                let line = Range::of_residuals(values, &gradient.predicted, scale).line(bits, scale);
-                words.push(line.word);
-                codes::pack(
-                    bits,
-                    &quantize(values, &gradient.predicted, &[line.line; 8], bits, scale),
-                    words,
-                );
-            }
-        }
+        Codec::Gradient { bits } => Prediction::gradient(values, scale).write(values, bits, scale, words),
+        Codec::Lattice { bits } => Prediction::lattice(values, scale).write(values, bits, scale, words),
         Codec::F16 => {
             let half = |value: f32| u32::from(f16::from_f32(value / scale.unit).to_bits());
             let pairs = values.as_chunks::<2>().0;
@@ -476,10 +473,10 @@ fn quantized_error_on(
     (!has_fog && !is_flipped).then(|| Error { squared, max: largest(max) * unit })
 }
 
-/// The corners of a brick and what they predict.
-struct Gradient {
+/// A few points and what their interpolation predicts of a brick.
+struct Prediction<const POINTS: usize> {
     line: StoredLine,
-    codes: [u8; 8],
+    codes: [u8; POINTS],
     predicted: Brick,
 }
 
@@ -500,34 +497,75 @@ const FIT: [[f32; 8]; 2] = {
 /// How often the fit is repeated where some voxels are empty.
 const EMPTY_ROUNDS: usize = 3;
 
-impl Gradient {
-    /// Fits corners. What they predict below the floor is as good as the floor, so where voxels are empty they are
+impl Prediction<8> {
+    fn gradient(values: &Brick, scale: &ChannelScale) -> Self {
+        Prediction::fit(values, scale, fit_corners, interpolate_corners)
+    }
+}
+
+impl Prediction<LATTICE_POINTS> {
+    fn lattice(values: &Brick, scale: &ChannelScale) -> Self {
+        Prediction::fit(values, scale, fit_lattice, interpolate_lattice)
+    }
+}
+
+impl<const POINTS: usize> Prediction<POINTS> {
+    /// Fits points. What they predict below the floor is as good as the floor, so where voxels are empty they are
     /// fitted to what was predicted there before, as far as that is below.
-    fn fit(values: &Brick, scale: &ChannelScale) -> Gradient {
+    fn fit(
+        values: &Brick,
+        scale: &ChannelScale,
+        fit: impl Fn(&Brick) -> [f32; POINTS],
+        interpolate: impl Fn(&[f32; POINTS], &mut Brick),
+    ) -> Self {
         let mut target = *values;
         let has_empty = values.contains(&scale.floor);
-        let mut corners = fit_corners(&target);
+        let mut points = fit(&target);
         if has_empty {
             let mut predicted = [0.0; BRICK_VOXELS];
             for _ in 0..EMPTY_ROUNDS {
-                interpolate_corners(&corners, &mut predicted);
+                interpolate(&points, &mut predicted);
                 for i in 0..BRICK_VOXELS {
                     let is_below = values[i] == scale.floor && predicted[i] < scale.floor;
                     target[i] = if is_below { predicted[i] } else { values[i] };
                 }
-                corners = fit_corners(&target);
+                points = fit(&target);
             }
         }
         // Bounds of entries end at twice the unit.
-        let corners = corners.map(|corner| corner.clamp(-1.9 * scale.unit, 1.9 * scale.unit));
-        let (min, max) = bounds(corners.into_iter());
+        let points = points.map(|point| point.clamp(-1.9 * scale.unit, 1.9 * scale.unit));
+        let (min, max) = bounds(points.into_iter());
         let line = StoredLine::covering(min, max, 255, scale.unit);
         let inverse = inverse(line.line);
-        let codes =
-            corners.map(|corner| ((corner - line.line.low) * inverse).round().clamp(0.0, 255.0) as u8);
+        let codes = points.map(|point| ((point - line.line.low) * inverse).round().clamp(0.0, 255.0) as u8);
         let mut predicted = [0.0; BRICK_VOXELS];
-        interpolate_corners(&codes.map(|code| line.line.at(code.into())), &mut predicted);
-        Gradient { line, codes, predicted }
+        interpolate(&codes.map(|code| line.line.at(code.into())), &mut predicted);
+        Prediction { line, codes, predicted }
+    }
+
+    /// Along with the range of what it leaves over.
+    fn ranged(self, values: &Brick, scale: &ChannelScale) -> (Self, Range) {
+        let residuals = Range::of_residuals(values, &self.predicted, scale);
+        (self, residuals)
+    }
+
+    /// The error with codes of some bits for the residuals, or without.
+    fn error(&self, residuals: Range, values: &Brick, bits: u8, scale: &ChannelScale) -> Option<Error> {
+        let line = match bits {
+            0 => Line::default(),
+            bits => residuals.line(bits, scale).line,
+        };
+        quantized_error(values, &self.predicted, &[line; 8], bits, scale)
+    }
+
+    fn write(&self, values: &Brick, bits: u8, scale: &ChannelScale, words: &mut Vec<u32>) {
+        words.push(self.line.word);
+        words.extend(self.codes.as_chunks::<4>().0.iter().map(|codes| u32::from_le_bytes(*codes)));
+        if bits > 0 {
+            let line = Range::of_residuals(values, &self.predicted, scale).line(bits, scale);
+            words.push(line.word);
+            codes::pack(bits, &quantize(values, &self.predicted, &[line.line; 8], bits, scale), words);
+        }
     }
 }
 
@@ -550,6 +588,57 @@ fn fit_corners(values: &Brick) -> [f32; 8] {
         }
     }
     std::array::from_fn(|corner| (0..8).map(|x| FIT[corner >> 2][x] * along_y[x][corner & 3]).sum())
+}
+
+/// The least-squares fit of four points to eight values along an axis: weights of the values for each point, which solve the
+/// normal equations of [`lattice_cell`]'s interpolation.
+static LATTICE_FIT: LazyLock<[[f32; 8]; 4]> = LazyLock::new(|| {
+    let mut interpolation = [[0.0_f64; 4]; 8];
+    for (voxel, weights) in interpolation.iter_mut().enumerate() {
+        let (cell, t) = lattice_cell(voxel);
+        (weights[cell], weights[cell + 1]) = (1.0 - f64::from(t), f64::from(t));
+    }
+    // Gauss and Jordan: the rows of the normal matrix, with the right sides behind.
+    let mut rows = [[0.0_f64; 12]; 4];
+    for (i, row) in rows.iter_mut().enumerate() {
+        for weights in &interpolation {
+            (0..4).for_each(|j| row[j] += weights[i] * weights[j]);
+        }
+        (0..8).for_each(|voxel| row[4 + voxel] = interpolation[voxel][i]);
+    }
+    for pivot in 0..4 {
+        rows[pivot] = rows[pivot].map(|value| value / rows[pivot][pivot]);
+        for i in (0..4).filter(|i| *i != pivot) {
+            let (factor, from) = (rows[i][pivot], rows[pivot]);
+            rows[i].iter_mut().zip(from).for_each(|(value, from)| *value -= factor * from);
+        }
+    }
+    rows.map(|row| std::array::from_fn(|voxel| row[4 + voxel] as f32))
+});
+
+/// The lattice whose trilinear interpolation is closest to the values.
+fn fit_lattice(values: &Brick) -> [f32; LATTICE_POINTS] {
+    let fit = &*LATTICE_FIT;
+    // Along z, then y, then x, as in `fit_corners`.
+    let mut along_z = [[0.0_f32; 4]; 64];
+    for (points, row) in along_z.iter_mut().zip(values.as_chunks::<8>().0) {
+        for (i, point) in points.iter_mut().enumerate() {
+            *point = row.iter().zip(&fit[i]).map(|(value, weight)| value * weight).sum();
+        }
+    }
+    let mut along_y = [[0.0_f32; 16]; 8];
+    for (plane, rows) in along_y.iter_mut().zip(along_z.as_chunks::<8>().0) {
+        for (y, row) in rows.iter().enumerate() {
+            for (i, point) in plane.iter_mut().enumerate() {
+                *point += fit[i >> 2][y] * row[i & 3];
+            }
+        }
+    }
+    let mut points = [0.0; LATTICE_POINTS];
+    for (i, point) in points.iter_mut().enumerate() {
+        *point = (0..8).map(|x| fit[i >> 4][x] * along_y[x][i & 15]).sum();
+    }
+    points
 }
 
 /// Decodes words that [`write()`] wrote.

@@ -39,6 +39,12 @@ pub enum Codec {
         /// The bits of a code, 0 to 8.
         bits: u8,
     },
+    /// The trilinear interpolation of a lattice of 4³ points, and what differs from it: as [`Codec::Gradient`], with sixteen
+    /// words of 8-bit codes of the points `x << 4 | y << 2 | z`.
+    Lattice {
+        /// The bits of a code, 0 to 5.
+        bits: u8,
+    },
     /// Codes of 1 to 8 bits between bounds of each octant of 4³ voxels: a word as in [`Codec::Uniform`], then, in four
     /// words, an 8-bit code of the lower bound of each octant `x << 2 | y << 1 | z` and one of its upper bound, two to a
     /// half word, the lower first; then the words of codes. A line of its own leads from one
@@ -74,6 +80,7 @@ impl Codec {
             Codec::F32 => 10,
             Codec::Shared => 11,
             Codec::Gradient { bits } => 16 + bits,
+            Codec::Lattice { bits } => 25 + bits,
             Codec::Block { format, axis } => {
                 let axis = match axis {
                     PackingAxis::X => 0,
@@ -100,6 +107,7 @@ impl Codec {
             10 => Some(Codec::F32),
             11 => Some(Codec::Shared),
             16..=24 => Some(Codec::Gradient { bits: tag - 16 }),
+            25..=30 => Some(Codec::Lattice { bits: tag - 25 }),
             32..=43 => {
                 let (format, axis) = (usize::from(tag - 32) / 4, usize::from(tag) % 4);
                 Some(Codec::Block { format: FORMATS[format], axis: *AXES.get(axis)? })
@@ -118,6 +126,8 @@ impl Codec {
             Codec::Uniform { bits } => 1 + codes::word_count(bits),
             Codec::Gradient { bits: 0 } => 3,
             Codec::Gradient { bits } => 4 + codes::word_count(bits),
+            Codec::Lattice { bits: 0 } => 1 + LATTICE_POINTS / 4,
+            Codec::Lattice { bits } => 2 + LATTICE_POINTS / 4 + codes::word_count(bits),
             Codec::Split { bits } => 5 + codes::word_count(bits),
             Codec::Shared => 3,
             Codec::Block { format, .. } => 1 + format.brick_bytes() / 4,
@@ -205,6 +215,34 @@ pub fn interpolate_corners(corners: &[f32; 8], out: &mut [f32; BRICK_VOXELS]) {
     }
 }
 
+/// The points of the lattice of [`Codec::Lattice`].
+pub const LATTICE_POINTS: usize = 64;
+
+/// The cell of the lattice that a voxel lies in along an axis, and where in it: the first and last voxels lie on the first and last
+/// points.
+pub const fn lattice_cell(voxel: usize) -> (usize, f32) {
+    let cell = if voxel == 7 { 2 } else { voxel * 3 / 7 };
+    (cell, (voxel * 3 - cell * 7) as f32 / 7.0)
+}
+
+/// The trilinear interpolation of a lattice, along x, then y, then z.
+pub fn interpolate_lattice(points: &[f32; LATTICE_POINTS], out: &mut [f32; BRICK_VOXELS]) {
+    for (x, plane) in out.as_chunks_mut::<64>().0.iter_mut().enumerate() {
+        let (cell, t) = lattice_cell(x);
+        let (low, high) = (&points[cell * 16..cell * 16 + 16], &points[cell * 16 + 16..cell * 16 + 32]);
+        let across: [f32; 16] = std::array::from_fn(|i| mix(low[i], high[i], t));
+        for (y, row) in plane.as_chunks_mut::<8>().0.iter_mut().enumerate() {
+            let (cell, t) = lattice_cell(y);
+            let ends: [f32; 4] =
+                std::array::from_fn(|i| mix(across[cell * 4 + i], across[cell * 4 + 4 + i], t));
+            for (z, value) in row.iter_mut().enumerate() {
+                let (cell, t) = lattice_cell(z);
+                *value = mix(ends[cell], ends[cell + 1], t);
+            }
+        }
+    }
+}
+
 /// The octant of a voxel.
 pub fn octant_of(voxel: usize) -> usize {
     (voxel >> 6 & 4) | (voxel >> 4 & 2) | (voxel >> 2 & 1)
@@ -276,6 +314,16 @@ impl BrickContext<'_> {
                     codes::unpack(bits, words, out, |predicted, code| predicted + line.at(code));
                 }
             }
+            (Codec::Lattice { bits }, [line, rest @ ..]) if rest.len() >= LATTICE_POINTS / 4 => {
+                let line = Line::from_word(*line, self.unit)?;
+                let (points, rest) = rest.split_at(LATTICE_POINTS / 4);
+                let code = |i: usize| points[i / 4] >> (i % 4 * 8) & 0xff;
+                interpolate_lattice(&std::array::from_fn(|i| line.at(code(i))), out);
+                if let [line, words @ ..] = rest {
+                    let line = Line::from_word(*line, self.unit)?;
+                    codes::unpack(bits, words, out, |predicted, code| predicted + line.at(code));
+                }
+            }
             (Codec::Split { bits }, [line, b0, b1, b2, b3, words @ ..]) => {
                 let line = Line::from_word(*line, self.unit)?;
                 let octants = octant_lines([*b0, *b1, *b2, *b3], line, bits);
@@ -315,7 +363,7 @@ mod tests {
     #[test]
     fn tags_and_codecs_are_inverse() {
         let all: Vec<Codec> = (0..=255).filter_map(Codec::from_tag).collect();
-        assert_eq!(all.len(), 38);
+        assert_eq!(all.len(), 44);
         for (i, codec) in all.iter().enumerate() {
             assert_eq!(Codec::from_tag(codec.tag()), Some(*codec));
             assert!(!all[..i].contains(codec));

@@ -52,7 +52,15 @@ const CORNERS: usize = 1;
 const SHAPE_OFFSETS: usize = 2;
 const SHAPE_TAGS: usize = 3;
 const OCTANTS: usize = 4;
-const HEAD_STREAMS: usize = 5;
+const LATTICES: usize = 5;
+const HEAD_STREAMS: usize = 6;
+
+/// The streams of a lattice with codes.
+const LATTICE: [usize; 18] = {
+    let mut streams = [LATTICES; 18];
+    (streams[0], streams[17]) = (LINES, LINES);
+    streams
+};
 
 /// Which streams the first words of a brick go to.
 fn head(codec: Codec) -> &'static [usize] {
@@ -61,6 +69,8 @@ fn head(codec: Codec) -> &'static [usize] {
         Codec::Uniform { .. } | Codec::Block { .. } => &[LINES],
         Codec::Gradient { bits: 0 } => &[LINES, CORNERS, CORNERS],
         Codec::Gradient { .. } => &[LINES, CORNERS, CORNERS, LINES],
+        Codec::Lattice { bits: 0 } => LATTICE.split_last().map_or(&[], |(_, head)| head),
+        Codec::Lattice { .. } => &LATTICE,
         Codec::Split { .. } => &[LINES, OCTANTS, OCTANTS, OCTANTS, OCTANTS],
         Codec::Shared => &[LINES, SHAPE_OFFSETS, SHAPE_TAGS],
     }
@@ -80,8 +90,13 @@ enum Values {
 impl Values {
     fn of(codec: Codec) -> Values {
         match codec {
-            Codec::Constant | Codec::Shared | Codec::Gradient { bits: 0 } => Values::None,
-            Codec::Uniform { bits } | Codec::Gradient { bits } | Codec::Split { bits } => Values::Codes(bits),
+            Codec::Constant | Codec::Shared | Codec::Gradient { bits: 0 } | Codec::Lattice { bits: 0 } => {
+                Values::None
+            }
+            Codec::Uniform { bits }
+            | Codec::Gradient { bits }
+            | Codec::Lattice { bits }
+            | Codec::Split { bits } => Values::Codes(bits),
             Codec::Block { .. } => Values::Blocks(codec.word_count() - 1),
             Codec::F16 => Values::Halves,
             Codec::F32 => Values::Floats,
