@@ -125,6 +125,13 @@ enum NanoEncoding {
     Fpn,
 }
 
+impl Args {
+    /// What is taken of each file, in words that differ where it does.
+    pub(crate) fn selection(&self) -> String {
+        format!("{:?} {:?} {:?} {:?}", self.grid, self.rename, self.crop, self.crop_world)
+    }
+}
+
 /// What `--codec` names.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum CodecChoice {
@@ -192,10 +199,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         Target::Packed(_) if args.split => {
             Err(Failure::Usage("--split is for outputs with the extension .vdb or .nvdb".into()))
         }
-        Target::Packed(options) => {
-            check_absent(output, args.force)?;
-            pack::run(args, &frames.concat(), &options, output)
-        }
+        Target::Packed(options) => pack::run(args, &frames.concat(), &options, output),
         target if is_pattern => {
             for frame in frames.concat() {
                 let pattern = output.to_string_lossy();

@@ -1,22 +1,26 @@
 //! `nuage convert … out.nuage`: a file or a sequence to one packed file.
 //!
-//! The options and the closing report live here; packing itself is the pipeline's.
+//! The options and the closing report live here, and what is done with files that are there already; packing itself is
+//! the pipeline's.
 
-use std::collections::HashSet;
+use std::collections::{HashMap, HashSet};
 use std::io::{self, BufWriter, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use nuage_pipeline::output::{OutputError, write_whole_with};
+use nuage_pipeline::pack::append;
 use nuage_pipeline::pack::assemble::Report;
 use nuage_pipeline::pack::options::{Bound, ChannelOptions, Options, unmet};
-use nuage_pipeline::pack::sequence::{FrameName, PackError, pack};
+use nuage_pipeline::pack::sequence::{FrameName, PackError, Surroundings, pack_with};
+use nuage_pipeline::pack::work::{Keep, Recipe, Work, file_digest};
 use nuage_pipeline::sequence::{FrameFile, FrameRange};
 use nuage_volume::codec::Codec;
-use nuage_volume::format::Role;
+use nuage_volume::format::{Asset, Role};
 
 use crate::convert;
 use crate::error::Failure;
+use crate::frames;
 use crate::progress;
 use crate::source::DiskFile;
 use crate::text::{number, one_line, thousands};
@@ -54,6 +58,14 @@ pub(crate) struct PackArgs {
     /// Frames per second, kept in .nuage files
     #[arg(long, value_name = "RATE")]
     fps: Option<f64>,
+
+    /// Add the frames to a .nuage file that is there, which keeps the quality that was asked of it and its rate
+    #[arg(long)]
+    pub(crate) append: bool,
+
+    /// Begin anew, and keep no finished frames for a run that takes up again where this one was stopped
+    #[arg(long)]
+    no_resume: bool,
 
     /// Frames of a sequence to convert, as in 1-100, 1-100x2 or 5,10-20; negative numbers too
     #[arg(long, value_name = "RANGE", allow_hyphen_values = true)]
@@ -134,7 +146,23 @@ fn spread<T: Clone>(
 
 impl PackArgs {
     /// The names of the options that were given, which are for packed files alone.
-    pub(crate) fn given(&self) -> [(&'static str, bool); 7] {
+    pub(crate) fn given(&self) -> [(&'static str, bool); 9] {
+        let [psnr, bits, role, unit, levels, shapes, fps] = self.of_file();
+        [
+            psnr,
+            bits,
+            role,
+            unit,
+            levels,
+            shapes,
+            fps,
+            ("--append", self.append),
+            ("--no-resume", self.no_resume),
+        ]
+    }
+
+    /// Those of them that say how a file is to be.
+    fn of_file(&self) -> [(&'static str, bool); 7] {
         [
             ("--psnr", !self.psnr.is_empty()),
             ("--bits-per-voxel", !self.bits_per_voxel.is_empty()),
@@ -157,6 +185,13 @@ impl PackArgs {
     ) -> Result<Options, Failure> {
         if self.fps.is_some_and(|rate| !rate.is_finite() || rate <= 0.0) {
             return Err(Failure::Usage("--fps must be a number above 0".into()));
+        }
+        let of_encoder = [("--max-error", !max_errors.is_empty()), ("--codec", !codecs.is_empty())];
+        let mut given = self.of_file().into_iter().chain(of_encoder).filter(|(_, is_given)| *is_given);
+        if let (true, Some((name, _))) = (self.append, given.next()) {
+            return Err(Failure::Usage(format!(
+                "{name} is not for --append: the file keeps what was asked of it"
+            )));
         }
         let mut channels = Vec::new();
         let max_error = spread("--max-error", max_errors, &mut channels, |asked| &mut asked.max_error)?;
@@ -207,26 +242,57 @@ pub(crate) fn run(
     output: &Path,
 ) -> Result<(), Failure> {
     let start = Instant::now();
-    let name = |frame: &FrameFile| {
-        let name = frame.path.file_name().unwrap_or(frame.path.as_os_str());
-        FrameName { number: frame.frame, name: name.to_string_lossy().into_owned() }
+    if args.pack.append && args.verify {
+        let hint = "--verify is not for --append: the errors of frames that are there cannot be found without their sources";
+        return Err(Failure::Usage(hint.into()));
+    }
+    let base = match args.pack.append {
+        true => Some(frames::open(output)?),
+        false => None,
     };
-    let names: Vec<FrameName> = frames.iter().map(name).collect();
-    let mut numbers = HashSet::new();
-    // A frame is asked for by its number, or by its place if it has none.
-    let number = |(place, name): (usize, &FrameName)| name.number.unwrap_or(place as i64 + 1);
-    if let Some(twice) = names.iter().enumerate().map(number).find(|number| !numbers.insert(*number)) {
-        return Err(Failure::Usage(format!(
-            "two frames would have the number {twice}; a .nuage file takes one sequence: put grids of several \
-             files together in .vdb files first"
-        )));
+    let options = match &base {
+        Some(base) => &append::options(base.contents()).ok_or_else(|| {
+            Failure::file(output, "the file does not say what was asked of it: convert all frames anew")
+        })?,
+        None => options,
+    };
+    let names: Vec<FrameName> = frames.iter().map(frame_name).collect();
+    check_numbers(base.as_ref(), &names, output)?;
+    let selection = args.selection();
+    let recipe = Recipe::new(options, args.pack.fps, &selection, digests(frames)?);
+    let base_digest = match &base {
+        Some(_) => Some(digest(output)?),
+        None => None,
+    };
+    let work = Work::beside(output, recipe.key(&names, base_digest));
+    if base.is_none() && !args.force && is_up_to_date(output, &recipe, &names) {
+        work.iter().for_each(Work::remove);
+        writeln!(io::stdout(), "{}: up to date", one_line(&output.display().to_string()))?;
+        return Ok(());
+    }
+    if base.is_none() {
+        convert::check_absent(output, args.force)?;
+    }
+    let kept = work.as_ref().filter(|_| !args.pack.no_resume);
+    let finished = kept.map_or(0, Work::finished_frames);
+    if finished > 0 {
+        let _ = writeln!(io::stderr(), "nuage: resuming: {finished} of {} frames were done", frames.len());
     }
     let bar = progress::bar(1);
     bar.set_message(one_line(&output.display().to_string()));
     let load = |frame: usize| convert::load(args, &frames[frame].path);
-    let written = write_whole_with(output, args.force, |file| {
+    let frames_before = base.as_ref().map_or(0, |base| base.contents().frames.len());
+    let overwrite = args.force || base.is_some();
+    let written = write_whole_with(output, overwrite, |file| {
+        // The file that is added to is closed before it is replaced.
+        let base = base;
+        let found = |name: &str| kept?.load(name);
+        let save = |name: &str, bytes: &[u8]| kept.iter().for_each(|work| work.save(name, bytes));
+        let keep = kept.map(|_| Keep { load: &found, save: &save });
+        let surroundings = Surroundings { base: base.as_ref(), recipe: Some(&recipe), keep };
         let mut done = |part: f64| bar.set_position((part * 1000.0) as u64);
-        let packed = pack(&names, load, BufWriter::new(&mut *file), options, args.pack.fps, &mut done);
+        let out = BufWriter::new(&mut *file);
+        let packed = pack_with(surroundings, &names, load, out, options, args.pack.fps, &mut done);
         let (report, plan) = packed.map_err(PackFailure::Pack)?;
         // What is wrong never gets the name that was asked for.
         let verified = match args.verify {
@@ -241,6 +307,7 @@ pub(crate) fn run(
         PackFailure::Pack(PackError::Load(failure)) | PackFailure::Verify(failure) => failure,
         PackFailure::Pack(other) => Failure::file(output, other.to_string()),
     })?;
+    work.iter().for_each(Work::remove);
     for what in &plan.left_out {
         let _ = writeln!(io::stderr(), "nuage: left out: {}", one_line(what));
     }
@@ -249,7 +316,7 @@ pub(crate) fn run(
     }
     let input_bytes =
         frames.iter().map(|frame| DiskFile::open(&frame.path).map_or(0, |file| file.size())).sum();
-    print(&report, output, input_bytes, start.elapsed().as_secs_f64())?;
+    print(&report, frames_before, output, input_bytes, start.elapsed().as_secs_f64())?;
     if let Some(verified) = verified {
         writeln!(io::stdout(), "  {verified}")?;
     }
@@ -257,6 +324,65 @@ pub(crate) fn run(
         let _ = writeln!(io::stderr(), "nuage: not met: {}", one_line(&missed.to_string()));
     }
     Ok(())
+}
+
+fn frame_name(frame: &FrameFile) -> FrameName {
+    let name = frame.path.file_name().unwrap_or(frame.path.as_os_str());
+    FrameName { number: frame.frame, name: name.to_string_lossy().into_owned() }
+}
+
+/// Makes sure that each frame has a number of its own, among those that are there as well.
+fn check_numbers(base: Option<&Asset>, names: &[FrameName], output: &Path) -> Result<(), Failure> {
+    let old = base.map_or(0, |base| base.contents().frames.len());
+    let mut numbers: HashSet<i64> =
+        base.iter().flat_map(|base| (0..old).map(|frame| frames::number(base, frame))).collect();
+    let before = numbers.clone();
+    for (place, name) in names.iter().enumerate() {
+        // A frame is asked for by its number, or by its place if it has none.
+        let number = name.number.unwrap_or((old + place) as i64 + 1);
+        if before.contains(&number) {
+            return Err(Failure::file(
+                output,
+                format!("there is a frame {number} already; nothing was added"),
+            ));
+        }
+        if !numbers.insert(number) {
+            return Err(Failure::Usage(format!(
+                "two frames would have the number {number}; a .nuage file takes one sequence: put grids of several \
+                 files together in .vdb files first"
+            )));
+        }
+    }
+    Ok(())
+}
+
+fn digest(path: &Path) -> Result<u128, Failure> {
+    // Opened first for the sake of what is no regular file.
+    DiskFile::open_plain(path)?;
+    file_digest(path).map_err(|error| Failure::file(path, format!("cannot read the file: {error}")))
+}
+
+/// A digest of each frame's source. The frames of a packed file have one source, and their numbers beside it.
+fn digests(frames: &[FrameFile]) -> Result<Vec<u128>, Failure> {
+    let mut known: HashMap<PathBuf, u128> = HashMap::new();
+    let digest = |frame: &FrameFile| {
+        let path = frames::packed(&frame.path).map_or_else(|| frame.path.clone(), |(path, _)| path);
+        match known.get(&path) {
+            Some(known) => Ok(*known),
+            None => {
+                let found = digest(&path)?;
+                known.insert(path, found);
+                Ok(found)
+            }
+        }
+    };
+    frames.iter().map(digest).collect()
+}
+
+/// Whether a sound file was made of the same frames by the same recipe.
+fn is_up_to_date(output: &Path, recipe: &Recipe, names: &[FrameName]) -> bool {
+    let Ok(asset) = frames::open(output) else { return false };
+    recipe.made(asset.contents(), names) && asset.check_pages().is_ok()
 }
 
 /// Why a packed file was not written.
@@ -273,23 +399,25 @@ impl From<OutputError> for PackFailure {
 }
 
 /// Says what became of the frames.
-fn print(report: &Report, output: &Path, input_bytes: u64, seconds: f64) -> io::Result<()> {
+fn print(report: &Report, before: usize, output: &Path, input_bytes: u64, seconds: f64) -> io::Result<()> {
     let mut out = io::stdout().lock();
     let rounded =
         |value: f64, digits: i32| number((value * 10.0_f64.powi(digits)).round() / 10.0_f64.powi(digits));
     let disk = report.summary.file_bytes;
     let ratio = rounded(disk as f64 / input_bytes.max(1) as f64 * 100.0, 1);
-    let frames = match report.contents.frames.len() {
+    let frames = match report.contents.frames.len() - before {
         1 => "1 frame".to_owned(),
         count => format!("{count} frames"),
     };
     let path = one_line(&output.display().to_string());
-    writeln!(
-        out,
-        "{path}: {frames}, {} bytes to {} ({ratio} %), {seconds:.2} s",
-        thousands(input_bytes),
-        thousands(disk)
-    )?;
+    let [from, to] = [input_bytes, disk].map(thousands);
+    match before {
+        0 => writeln!(out, "{path}: {frames}, {from} bytes to {to} ({ratio} %), {seconds:.2} s")?,
+        _ => writeln!(
+            out,
+            "{path}: {frames} of {from} bytes added to {before}, now {to} bytes, {seconds:.2} s"
+        )?,
+    }
     let memory = report.tree_bytes + report.brick_bytes + report.shape_bytes;
     let voxels = report.source_bricks * 512;
     let per_voxel = |bytes: u64| rounded(bytes as f64 * 8.0 / voxels.max(1) as f64, 2);

@@ -261,33 +261,167 @@ fn damage_is_noticed_wherever_it_is() {
     fails(["info", &bad], 1, "bad.nuage");
 }
 
+#[test]
+fn frames_are_added_to_a_file() {
+    let folder = Folder(tempfile::tempdir().unwrap());
+    let (input, all, some) = (blast("####"), folder.at("all.nuage"), folder.at("some.nuage"));
+    let input = input.to_str().unwrap();
+    let convert = |frames: &str, output: &str, more: &[&str]| {
+        let args = ["convert", frames, input, output];
+        args.iter().chain(more).map(|arg| (*arg).to_owned()).collect::<Vec<String>>()
+    };
+    succeeds(convert("--frames=1-10", &all, &["--max-error=1%", "--fps=25"]));
+    succeeds(convert("--frames=1-6", &some, &["--max-error=1%", "--fps=25"]));
+    let before = folder.at("before.nuage");
+    fs::copy(&some, &before).unwrap();
+    let said = succeeds(convert("--frames=7-10", &some, &["--append"]));
+    assert!(said.contains("4 frames") && said.contains("added to 6"), "{said}");
+    assert!(succeeds(["info", &some]).contains("10 (1 to 10, 25 per second)"));
+    assert!(succeeds(["validate", &some]).contains("valid"));
+    for number in 1..=6 {
+        let said = succeeds(["diff", &format!("{before}#{number}"), &format!("{some}#{number}")]);
+        assert!(said.ends_with("equal\n"), "{said}");
+    }
+    for number in 7..=10 {
+        let [one, other] = [&all, &some].map(|file| format!("{file}#{number}"));
+        // Both are within a hundredth of the peak.
+        let bounds = differences(&one, &other);
+        assert!(bounds.iter().all(|difference| *difference < 0.5), "{bounds:?}");
+    }
+    let [all_bytes, some_bytes] = [&all, &some].map(|file| fs::metadata(file).unwrap().len() as f64);
+    assert!(some_bytes < 1.05 * all_bytes, "{some_bytes} of {all_bytes}");
+    // What makes no sense changes nothing.
+    let whole = fs::read(&some).unwrap();
+    fails(convert("--frames=10-11", &some, &["--append"]), 1, "there is a frame 10 already");
+    fails(convert("--frames=11", &some, &["--append", "--psnr=40"]), 2, "--psnr is not for --append");
+    fails(convert("--frames=11", &some, &["--append", "--max-error=1"]), 2, "--max-error is not for");
+    fails(convert("--frames=11", &folder.at("none.nuage"), &["--append"]), 1, "none.nuage");
+    fails(convert("--frames=11", &folder.at("none.vdb"), &["--append"]), 2, "--append is for");
+    assert!(fs::read(&some).unwrap() == whole);
+    // Nor does a file that is damaged, in its pages or in what stands behind them.
+    for at in [100, whole.len() / 2, whole.len() - 500, whole.len() - 3] {
+        let mut damaged = whole.clone();
+        damaged[at] ^= 1;
+        fs::write(&some, &damaged).unwrap();
+        fails(convert("--frames=11", &some, &["--append"]), 1, "some.nuage");
+        assert!(fs::read(&some).unwrap() == damaged, "damage at byte {at}");
+    }
+    let names: Vec<String> = folder.names().into_iter().filter(|name| name.ends_with("nuage")).collect();
+    assert_eq!(names, ["all.nuage", "before.nuage", "some.nuage"]);
+}
+
+#[test]
+fn what_is_up_to_date_is_not_made_again() {
+    let folder = Folder(tempfile::tempdir().unwrap());
+    for number in [1, 2] {
+        fs::copy(blast(&format!("{number:04}")), folder.at(&format!("a.{number}.vdb"))).unwrap();
+    }
+    let (input, output) = (folder.at("a.#.vdb"), folder.at("a.nuage"));
+    let convert = |more: &[&str]| {
+        let args = ["convert", "--crop=24,24,8,39,39,23", &input, &output];
+        args.iter().chain(more).map(|arg| (*arg).to_owned()).collect::<Vec<String>>()
+    };
+    succeeds(convert(&[]));
+    let (made, when) = (fs::read(&output).unwrap(), fs::metadata(&output).unwrap().modified().unwrap());
+    // Of the sources their bytes count, whenever they were written.
+    fs::write(folder.at("a.1.vdb"), fs::read(blast("0001")).unwrap()).unwrap();
+    assert!(succeeds(convert(&[])).contains("up to date"));
+    assert_eq!(fs::metadata(&output).unwrap().modified().unwrap(), when);
+    for other in ["--psnr=30", "--fps=24", "--levels=1", "--frames=1", "--rename=density=d"] {
+        fails(convert(&[other]), 1, "--force");
+    }
+    assert!(!succeeds(convert(&["--force"])).contains("up to date"));
+    assert!(fs::read(&output).unwrap() == made);
+    let mut damaged = made.clone();
+    damaged[70] ^= 1;
+    fs::write(&output, &damaged).unwrap();
+    fails(convert(&[]), 1, "--force");
+    fs::write(&output, &made).unwrap();
+    fs::copy(blast("0003"), folder.at("a.2.vdb")).unwrap();
+    fails(convert(&[]), 1, "--force");
+    assert!(fs::read(&output).unwrap() == made);
+    assert_eq!(folder.names(), ["a.1.vdb", "a.2.vdb", "a.nuage"]);
+}
+
+/// The work that is kept beside `out.nuage`.
+#[cfg(unix)]
+fn finished_frames(folder: &Folder) -> usize {
+    let entries = fs::read_dir(folder.at(".out.nuage.work")).into_iter().flatten();
+    entries
+        .filter(|entry| entry.as_ref().unwrap().file_name().to_str().unwrap().starts_with("frame."))
+        .count()
+}
+
 #[cfg(unix)]
 #[test]
-fn a_conversion_that_is_killed_leaves_nothing_or_all() {
+fn a_conversion_that_is_killed_leaves_nothing_or_all_and_is_taken_up_again() {
     let folder = Folder(tempfile::tempdir().unwrap());
     let (input, output) = (blast("####"), folder.at("out.nuage"));
-    let args = ["convert", "--frames=1-3", "--force", input.to_str().unwrap(), &output];
-    let start = Instant::now();
-    succeeds(args);
-    let (whole, took) = (fs::read(&output).unwrap(), start.elapsed());
-    for part in 0..8 {
+    let input = input.to_str().unwrap();
+    let args = ["convert", "--crop=24,24,8,39,39,31", "--frames=1-8", "--force", input, &output];
+    let with_threads = |threads: u64| {
+        let mut command = command(args);
+        command.env("RAYON_NUM_THREADS", threads.to_string()).stdout(Stdio::null()).stderr(Stdio::piped());
+        command
+    };
+    let mut took = Duration::ZERO;
+    let mut whole = Vec::new();
+    for threads in [1, 2] {
+        let start = Instant::now();
+        assert!(with_threads(threads).status().unwrap().success());
+        took = start.elapsed();
+        let made = fs::read(&output).unwrap();
+        assert!(threads == 1 || made == whole, "another file with {threads} threads");
+        whole = made;
+    }
+    let mut seed = 1_u64;
+    let mut random = |end: u64| {
+        seed = seed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (seed >> 33) % end
+    };
+    let mut kill_after = |part: f64| {
         // Half of the times something stands there before.
-        let before = if part % 2 == 0 { Some(b"precious".to_vec()) } else { None };
+        let before = if random(2) == 0 { Some(b"precious".to_vec()) } else { None };
         let _ = fs::remove_file(&output);
         if let Some(before) = &before {
             fs::write(&output, before).unwrap();
         }
-        let mut child = command(args).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
-        std::thread::sleep(took.mul_f64(0.1 + 0.125 * f64::from(part)).min(Duration::from_secs(2)));
+        let mut child = with_threads(1 + random(2)).spawn().unwrap();
+        std::thread::sleep(took.mul_f64(part));
         child.kill().unwrap();
         child.wait().unwrap();
         let after = fs::read(&output).ok();
-        assert!(
-            after == before || after.as_ref() == Some(&whole),
-            "{:?} bytes",
-            after.map(|bytes| bytes.len())
-        );
+        let bytes = after.as_ref().map(Vec::len);
+        assert!(after == before || after.as_ref() == Some(&whole), "{bytes:?} bytes, {part} of the time");
+        random(1000) as f64 / 1000.0
+    };
+    let mut part = 0.5;
+    for kill in 0..50 {
+        part = kill_after(part);
+        // Now and then from the start again.
+        if kill % 4 == 0 {
+            let _ = fs::remove_dir_all(folder.at(".out.nuage.work"));
+        }
     }
+    // Where a run ends before it is killed, nothing is left to take up.
+    let _ = fs::remove_dir_all(folder.at(".out.nuage.work"));
+    let mut part = 0.5;
+    for _ in 0..40 {
+        kill_after(part);
+        if finished_frames(&folder) > 0 {
+            break;
+        }
+        part = if fs::read(&output).is_ok_and(|bytes| bytes == whole) { part * 0.9 } else { part * 1.1 };
+    }
+    assert!(finished_frames(&folder) > 0, "no run was killed between its first frame and its last");
+    let last = with_threads(2).output().unwrap();
+    assert!(last.status.success() && stderr(&last).contains("resuming: "), "{}", stderr(&last));
+    assert!(stderr(&last).contains(" of 8 frames were done"), "{}", stderr(&last));
+    assert!(fs::read(&output).unwrap() == whole);
+    assert!(!fs::exists(folder.at(".out.nuage.work")).unwrap());
+    // What is kept is not looked at unasked.
+    let again = with_threads(2).arg("--no-resume").output().unwrap();
+    assert!(!stderr(&again).contains("resuming") && fs::read(&output).unwrap() == whole);
 }
 
 /// What `diff --json` says.

@@ -28,7 +28,7 @@ const LAST_STEP: i32 = 40 * STEPS_PER_OCTAVE;
 const STEPS: usize = (LAST_STEP - FIRST_STEP + 1) as usize;
 
 /// The weight of a squared error of 1, in units of a channel, in words.
-#[derive(Debug, Clone, Copy, PartialEq, PartialOrd)]
+#[derive(Debug, Clone, Copy, PartialEq, PartialOrd, serde::Serialize, serde::Deserialize)]
 pub struct Lambda(f64);
 
 impl Lambda {
@@ -36,6 +36,21 @@ impl Lambda {
     pub const NONE: Lambda = Lambda(0.0);
     /// The largest of the ladder.
     pub const LARGEST: Lambda = Lambda((1_u64 << (LAST_STEP / STEPS_PER_OCTAVE)) as f64);
+
+    /// The λ of a weight in words.
+    pub fn of_weight(words: f64) -> Lambda {
+        Lambda(words)
+    }
+
+    /// The weight in words.
+    pub fn weight(self) -> f64 {
+        self.0
+    }
+
+    /// The larger of two.
+    pub fn max(self, other: Lambda) -> Lambda {
+        Lambda(self.0.max(other.0))
+    }
 
     fn of_step(step: usize) -> Lambda {
         let octaves = (step as i32 + FIRST_STEP) as f64 / f64::from(STEPS_PER_OCTAVE);

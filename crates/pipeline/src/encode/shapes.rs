@@ -79,6 +79,12 @@ impl Shapes {
             words
         };
         let words: Vec<Vec<u32>> = find(&in_units, &settings).iter().map(encode).collect();
+        let limit = settings.max_mse.min(settings.max_error.powi(2)) * BRICK_VOXELS as f32;
+        Shapes::of(words, limit)
+    }
+
+    /// Shapes from their words, and from what a shape may leave.
+    pub fn of(words: Vec<Vec<u32>>, limit: f32) -> Shapes {
         let decode = |words: &Vec<u32>| {
             let mut values = [0.0; BRICK_VOXELS];
             let context = BrickContext { words, shapes: &[], unit: 1.0, floor: f32::MIN };
@@ -87,8 +93,13 @@ impl Shapes {
             values
         };
         let matcher = Matcher::new(words.iter().map(decode).collect());
-        let limit = settings.max_mse.min(settings.max_error.powi(2)) * BRICK_VOXELS as f32;
         Shapes { words, matcher, limit }
+    }
+
+    /// Bricks of which a shape may leave more than this, the sum of squares over all voxels in units of the channel, are
+    /// not compared.
+    pub fn limit(&self) -> f32 {
+        self.limit
     }
 
     /// The likeliest ways to have a brick as a shape.

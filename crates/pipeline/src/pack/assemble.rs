@@ -1,7 +1,7 @@
 //! Putting encoded frames one after the other into a file.
 //!
 //! Equal bricks stand in the file once, whatever frame and channel they come from, and so do equal nodes and masks. Only
-//! a digest of each brick is kept; the words go to the writer at once.
+//! a digest of each brick is kept; the words go to the writer at once. Frames of another file may come first, as they are.
 
 use std::collections::HashMap;
 use std::io::{Seek, Write};
@@ -12,14 +12,17 @@ use glam::IVec3;
 use nuage_volume::brick::BrickSummary;
 use nuage_volume::build::{BuildError, TreeBuilder};
 use nuage_volume::codec::{BrickContext, Codec};
-use nuage_volume::format::{ChannelInfo, Contents, FormatError, Frame, FrameGrid, Quality, Summary, Writer};
+use nuage_volume::format::{
+    Asset, ChannelInfo, Contents, Encoding, FormatError, Frame, FrameGrid, Quality, Summary, Writer,
+};
 use nuage_volume::packed::TreeRef;
 use nuage_volume::packed::build::{EntryScale, Packer, TooLarge};
 use nuage_volume::space::BRICK_VOXELS;
 
+use super::append::asked;
 use super::frame::{ENTRY_WORDS, EncodedFrame, EncodedGrid, EncodedLevel};
 use super::options::Options;
-use super::plan::Plan;
+use super::plan::{ChannelPlan, Plan};
 use crate::each;
 use crate::encode::shapes::{SHAPE_CODEC, Shapes};
 
@@ -56,7 +59,7 @@ pub struct Report {
     pub source_bricks: u64,
     /// The bricks that are stored, of all levels.
     pub bricks_stored: u64,
-    /// What each channel takes.
+    /// What each channel takes in the frames that were added.
     pub channels: Vec<ChannelSize>,
 }
 
@@ -79,6 +82,42 @@ impl ChannelSize {
     }
 }
 
+/// A channel of a file before its first frame.
+fn channel_info(planned: &ChannelPlan, options: &Options) -> ChannelInfo {
+    let scale = planned.scale(0.0);
+    let asked = options.for_channel(&planned.key.grid);
+    ChannelInfo {
+        name: planned.key.grid.clone(),
+        component: planned.key.component,
+        role: planned.role,
+        physical_unit: asked.physical_unit.unwrap_or_default(),
+        unit: scale.unit,
+        floor: scale.floor,
+        peak: planned.peak(),
+        quality: Quality::default(),
+        asked_max_error: asked.max_error.map(|bound| bound.of(planned.peak())),
+        asked_psnr: asked.psnr,
+        encoding: Some(Encoding {
+            lambda: planned.lambda.weight(),
+            range: [planned.min, planned.max],
+            source_bricks: 0,
+        }),
+    }
+}
+
+/// What a brick is found again by.
+fn digest(codec: Codec, words: &[u32]) -> u128 {
+    let mut digest = xxhash_rust::xxh3::Xxh3::new();
+    digest.update(&[codec.tag()]);
+    digest.update(bytemuck::cast_slice(words));
+    digest.digest128()
+}
+
+/// A digest as it stands in a file.
+pub fn hex(digest: u128) -> String {
+    format!("{digest:032x}")
+}
+
 /// Writes frames to a file.
 pub struct Assembler<'c, W: Write + Seek> {
     writer: Writer<'c, W>,
@@ -91,7 +130,12 @@ pub struct Assembler<'c, W: Write + Seek> {
     /// The shapes of each channel.
     channel_shapes: Vec<Arc<Shapes>>,
     stored_words: u64,
-    channels: Vec<ChannelSize>,
+    /// The bricks and words that frames took which were added, by channel of the file.
+    sizes: Vec<ChannelSize>,
+    /// Which channel of the file each one of the plan is.
+    channels: Vec<usize>,
+    /// Whether there are frames of another file, among which new ones have their place by number.
+    is_continued: bool,
 }
 
 impl<'c, W: Write + Seek> Assembler<'c, W> {
@@ -106,36 +150,80 @@ impl<'c, W: Write + Seek> Assembler<'c, W> {
         options: &Options,
         frame_rate: Option<f64>,
     ) -> Result<Self, AssembleError> {
-        let channel = |planned: &super::plan::ChannelPlan| {
-            let (scale, peak) = (planned.scale(0.0), planned.peak());
-            let asked = options.for_channel(&planned.key.grid);
-            ChannelInfo {
-                name: planned.key.grid.clone(),
-                component: planned.key.component,
-                role: planned.role,
-                physical_unit: asked.physical_unit.unwrap_or_default(),
-                unit: scale.unit,
-                floor: scale.floor,
-                peak,
-                quality: Quality::default(),
-                asked_max_error: asked.max_error.map(|bound| bound.of(peak)),
-                asked_psnr: asked.psnr,
-            }
+        let channels = plan.channels.iter().map(|planned| channel_info(planned, options));
+        let contents = Contents {
+            frame_rate,
+            channels: channels.collect(),
+            asked: Some(asked(options)),
+            ..Contents::default()
         };
-        let channels: Vec<ChannelInfo> = plan.channels.iter().map(channel).collect();
         Ok(Assembler {
-            channels: vec![ChannelSize::default(); channels.len()],
+            sizes: vec![ChannelSize::default(); contents.channels.len()],
             writer: Writer::new(out, compress)?,
             packer: Packer::default(),
-            contents: Contents { frame_rate, channels, frames: Vec::new() },
+            channels: (0..contents.channels.len()).collect(),
+            contents,
             bricks: HashMap::new(),
             shapes: HashMap::new(),
             channel_shapes: plan.channels.iter().map(|channel| Arc::clone(&channel.shapes)).collect(),
             stored_words: 0,
+            is_continued: false,
         })
     }
 
-    /// Adds a frame behind those that are there.
+    /// Begins a file with all that is in another: its bricks, nodes and masks as they are. The plan has been
+    /// settled ([`settle`](super::append::settle)).
+    ///
+    /// # Errors
+    /// If nothing can be written, or the other file is damaged.
+    pub fn onto(
+        out: W,
+        compress: &'c dyn Fn(&[u8]) -> Vec<u8>,
+        base: &Asset,
+        plan: &Plan,
+        options: &Options,
+    ) -> Result<Self, AssembleError> {
+        let mut assembler = Assembler::new(out, compress, &Plan::default(), options, None)?;
+        assembler.is_continued = true;
+        // One file made of all frames at once would be another.
+        assembler.contents = Contents { recipe: None, ..base.contents().clone() };
+        assembler.packer = Packer::onto(base.trees().clone());
+        let store = base.store();
+        let mut rest = store.shape_words();
+        for codec in store.shape_codecs() {
+            assembler.writer.shape(*codec, rest.split_off(..codec.word_count()).unwrap_or_default())?;
+        }
+        for (i, page) in store.pages().iter().enumerate() {
+            let (words, mut offset) = assembler.writer.copy_page(base, i)?;
+            let mut rest = &words[..];
+            for codec in &store.codecs()[page.bricks()] {
+                let words = rest.split_off(..codec.word_count()).unwrap_or_default();
+                assembler.bricks.entry(digest(*codec, words)).or_insert(offset);
+                offset += words.len() as u32;
+            }
+            assembler.stored_words += words.len() as u64;
+        }
+        assembler.channel_shapes = plan.channels.iter().map(|channel| Arc::clone(&channel.shapes)).collect();
+        let channels = &mut assembler.contents.channels;
+        for planned in &plan.channels {
+            let index = planned.before.map_or(channels.len(), |before| before.channel);
+            match (channels.get_mut(index), planned.before) {
+                (Some(channel), Some(before)) => channel.peak = before.peak,
+                _ => channels.push(channel_info(planned, options)),
+            }
+            assembler.channels.push(index);
+        }
+        assembler.sizes = vec![ChannelSize::default(); channels.len()];
+        Ok(assembler)
+    }
+
+    /// Notes in the file what it is made by.
+    pub fn note_recipe(&mut self, recipe: u128) {
+        self.contents.recipe = Some(hex(recipe)).filter(|_| !self.is_continued);
+    }
+
+    /// Adds a frame behind those that are there, or among those of another file where its number belongs. `source` is a
+    /// digest of what it was made of.
     ///
     /// # Errors
     /// If it cannot be written or the file becomes too large.
@@ -144,20 +232,26 @@ impl<'c, W: Write + Seek> Assembler<'c, W> {
         frame: &EncodedFrame,
         number: Option<i64>,
         name: &str,
+        source: Option<u128>,
     ) -> Result<(), AssembleError> {
         let mut grids = Vec::with_capacity(frame.grids.len());
         for grid in &frame.grids {
             let levels = grid.levels.iter().map(|level| self.add_level(level, grid));
             let levels = levels.collect::<Result<_, _>>()?;
-            let size = &mut self.channels[grid.channel];
+            let index = self.channels[grid.channel];
+            let channel = &mut self.contents.channels[index];
+            if let Some(encoding) = &mut channel.encoding {
+                encoding.source_bricks = encoding.source_bricks.saturating_add(grid.source_bricks);
+            }
+            let size = &mut self.sizes[index];
             size.bricks += grid.source_bricks;
             size.words += grid.levels.first().map_or(0, |level| level.words.len() as u64);
-            let quality = &mut self.contents.channels[grid.channel].quality;
+            let quality = &mut channel.quality;
             quality.max_error = quality.max_error.max(grid.quality.max_error);
             quality.squared_error += grid.quality.squared_error;
-            quality.voxels += grid.quality.voxels;
+            quality.voxels = quality.voxels.saturating_add(grid.quality.voxels);
             grids.push(FrameGrid {
-                channel: grid.channel as u32,
+                channel: index as u32,
                 levels,
                 index_offset: grid.index_offset,
                 active_box: grid.active_box,
@@ -165,7 +259,13 @@ impl<'c, W: Write + Seek> Assembler<'c, W> {
                 source_header: grid.source_header.clone(),
             });
         }
-        self.contents.frames.push(Frame { number, name: name.to_owned(), grids });
+        let frames = &mut self.contents.frames;
+        let is_before = |frame: &Frame| frame.number.is_none_or(|other| number.is_none_or(|it| other < it));
+        let place = match self.is_continued {
+            true => frames.iter().rposition(is_before).map_or(0, |last| last + 1),
+            false => frames.len(),
+        };
+        frames.insert(place, Frame { number, name: name.to_owned(), grids, source: source.map(hex) });
         Ok(())
     }
 
@@ -199,14 +299,12 @@ impl<'c, W: Write + Seek> Assembler<'c, W> {
         let mut places = Vec::with_capacity(bricks.len());
         for ((place, codec, words), summary) in bricks.iter().zip(summaries) {
             builder.brick(*place, summary)?;
-            let mut digest = xxhash_rust::xxh3::Xxh3::new();
-            digest.update(&[codec.tag()]);
-            digest.update(bytemuck::cast_slice(words));
-            let offset = match self.bricks.get(&digest.digest128()) {
+            let digest = digest(*codec, words);
+            let offset = match self.bricks.get(&digest) {
                 Some(offset) => *offset,
                 None => {
                     let offset = self.writer.brick(*codec, words)?;
-                    self.bricks.insert(digest.digest128(), offset);
+                    self.bricks.insert(digest, offset);
                     self.stored_words += words.len() as u64;
                     offset
                 }
@@ -258,9 +356,14 @@ impl<'c, W: Write + Seek> Assembler<'c, W> {
             brick_bytes: 4 * self.stored_words,
             shape_bytes,
             entries: trees.entries.len() as u64,
-            source_bricks: self.channels.iter().map(|size| size.bricks).sum(),
+            source_bricks: self
+                .contents
+                .channels
+                .iter()
+                .filter_map(|channel| Some(channel.encoding?.source_bricks))
+                .fold(0, u64::saturating_add),
             bricks_stored: self.bricks.len() as u64,
-            channels: self.channels,
+            channels: self.sizes,
             contents: self.contents,
         })
     }

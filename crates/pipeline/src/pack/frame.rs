@@ -229,21 +229,32 @@ pub(super) const ENTRY_WORDS: f64 = 3.0;
 /// What a channel's bricks have to keep to, over all frames, squared errors in its unit.
 fn target(planned: &ChannelPlan, options: &Options) -> Target {
     let options = options.for_channel(&planned.key.grid);
-    let scale = planned.scale(0.0);
-    let peak = f64::from(planned.peak() / scale.unit);
+    // What frames before these have used up, and what they are allowed.
+    let (peak, voxels, squared) = match planned.before {
+        Some(before) => (before.peak, before.voxels, before.squared_error),
+        None => (planned.peak(), 0, 0.0),
+    };
+    let peak = f64::from(peak / planned.scale(0.0).unit);
+    let voxels = (voxels as f64) + planned.voxels as f64;
     Target {
         squared_error: options
             .psnr
-            .map(|decibels| planned.voxels as f64 * peak.powi(2) / 10.0_f64.powf(decibels / 10.0)),
+            .map(|decibels| (voxels * peak.powi(2) / 10.0_f64.powf(decibels / 10.0) - squared).max(0.0)),
         words: options
             .bits_per_voxel
             .map(|bits| ((bits * 16.0 - ENTRY_WORDS) * planned.bricks as f64).max(0.0) as u64),
     }
 }
 
-/// The λ with which a channel meets what is asked of it, from the sums over all its bricks.
+/// The λ with which a channel meets what is asked of it, from the sums over all its bricks. That of frames before these
+/// stays, so that equal bricks get equal words, unless all together would then miss the ratio that was asked for. A size
+/// was shared out among the frames that were there.
 pub fn settle(totals: &Totals, planned: &ChannelPlan, options: &Options) -> Lambda {
-    totals.lambda(&target(planned, options))
+    match planned.before {
+        None => totals.lambda(&target(planned, options)),
+        Some(before) if options.bits_per_voxel.is_some() => before.lambda,
+        Some(before) => totals.lambda(&target(planned, options)).max(before.lambda),
+    }
 }
 
 /// Finds the shapes of each channel, in bricks of some frames of the sequence. A codec that is asked for has none.
@@ -300,6 +311,7 @@ pub fn weigh_frame(
             Some(squared) => Lambda::sure(planned.bricks, squared),
             None => Lambda::LARGEST,
         };
+        let largest = planned.before.map_or(largest, |before| largest.max(before.lambda));
         let choice = Choice::new(planned, options, largest);
         let level = Level::of(&tree.tree, IVec3::ZERO);
         let curves = each(level.bricks.len(), |i| choice.curve(&level.bricks[i], &scale));

@@ -127,11 +127,12 @@ impl Options {
         names.chain([""]).any(|name| self.for_channel(name).is_weighed())
     }
 
-    /// Gives the channels of a plan the roles that are asked for.
+    /// Gives the channels of a plan the roles that are asked for, as far as they are there.
     ///
     /// # Errors
     /// If something is asked of a channel that the plan does not have.
     pub(super) fn apply(&self, plan: &mut Plan) -> Result<(), NoSuchChannel> {
+        let mut missing = None;
         for (name, asked) in &self.channels {
             let mut is_there = false;
             for channel in plan.channels.iter_mut().filter(|channel| channel.key.grid == *name) {
@@ -141,10 +142,10 @@ impl Options {
             if !is_there {
                 let mut there: Vec<String> = plan.channels.iter().map(|c| c.key.grid.clone()).collect();
                 there.dedup();
-                return Err(NoSuchChannel { name: name.clone(), there });
+                missing = missing.or(Some(NoSuchChannel { name: name.clone(), there }));
             }
         }
-        Ok(())
+        missing.map_or(Ok(()), Err)
     }
 }
 

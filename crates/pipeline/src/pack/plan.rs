@@ -19,7 +19,7 @@ pub const LARGEST: f32 = 8.507_059e37; // 2¹²⁶
 pub(crate) const BACKGROUND_TOLERANCE: f32 = 1e-3;
 
 /// Which channel a tree of numbers belongs to: frames are matched by it.
-#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize)]
 pub struct ChannelKey {
     /// The name of the grid.
     pub grid: String,
@@ -30,7 +30,7 @@ pub struct ChannelKey {
 }
 
 /// A channel of a sequence.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct ChannelPlan {
     /// Which one it is.
     pub key: ChannelKey,
@@ -47,11 +47,29 @@ pub struct ChannelPlan {
     /// The weight of errors with which the channel meets what is asked of it.
     pub lambda: Lambda,
     /// The shapes that bricks may share.
+    #[serde(skip)]
     pub shapes: Arc<Shapes>,
+    /// What of it is encoded already, if frames are added to a file. Range and scale are then those of the file.
+    pub before: Option<Before>,
+}
+
+/// What a file holds of a channel before frames are added.
+#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
+pub struct Before {
+    /// The index of the channel in the file.
+    pub channel: usize,
+    /// The weight of errors that it was encoded with.
+    pub lambda: Lambda,
+    /// The largest magnitude over old and new frames, which may be more than the range says but not than the unit.
+    pub peak: f32,
+    /// The sum of squared errors, in the channel's unit.
+    pub squared_error: f64,
+    /// The voxels over which these are summed.
+    pub voxels: u64,
 }
 
 /// The channels of a sequence, in the order in which they were met.
-#[derive(Debug, Clone, Default, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct Plan {
     /// The channels.
     pub channels: Vec<ChannelPlan>,
@@ -106,6 +124,7 @@ impl Plan {
                 bricks,
                 lambda: Lambda::NONE,
                 shapes: Arc::default(),
+                before: None,
             }
         });
         self.merge(Plan { channels: channels.collect(), left_out });

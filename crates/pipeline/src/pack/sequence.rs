@@ -7,13 +7,16 @@
 use std::io::{Seek, Write};
 
 use nuage_vdb::{Grid, Metadata};
+use nuage_volume::format::Asset;
 
+use super::append;
 use super::assemble::{AssembleError, Assembler, Report};
 use super::frame::{
     EncodeError, EncodedFrame, WeighedChannel, encode_frame, find_shapes, settle, weigh_frame,
 };
 use super::options::{NoSuchChannel, Options};
 use super::plan::Plan;
+use super::work::{self, Keep, Recipe};
 use crate::each;
 use crate::encode::choose::Totals;
 
@@ -46,11 +49,21 @@ pub enum PackError<E> {
     Assemble(#[from] AssembleError),
 }
 
-/// Packs the frames that `load` gives, by their index, into `out`. `done` is told of each frame that is finished, in
-/// any of the passes, as a part of the whole.
+/// What frames are packed with, apart from what is asked.
+#[derive(Clone, Copy, Default)]
+pub struct Surroundings<'a> {
+    /// The file that frames are added to. It says what is asked ([`append::options`]), and keeps its frame rate.
+    pub base: Option<&'a Asset>,
+    /// What is noted of where the frames come from.
+    pub recipe: Option<&'a Recipe>,
+    /// Where finished work is kept.
+    pub keep: Option<Keep<'a>>,
+}
+
+/// As [`pack_with`], with nothing around.
 ///
 /// # Errors
-/// If a frame cannot be loaded or encoded, a channel that is asked for by name is in none, or the file cannot be written.
+/// As those of [`pack_with`].
 pub fn pack<E: Send, W: Write + Seek>(
     frames: &[FrameName],
     load: impl Fn(usize) -> Result<Loaded, E> + Sync,
@@ -59,8 +72,25 @@ pub fn pack<E: Send, W: Write + Seek>(
     frame_rate: Option<f64>,
     done: &mut dyn FnMut(f64),
 ) -> Result<(Report, Plan), PackError<E>> {
-    let is_weighed = options.is_weighed();
-    let passes = if is_weighed { 3 } else { 2 };
+    pack_with(Surroundings::default(), frames, load, out, options, frame_rate, done)
+}
+
+/// Packs the frames that `load` gives, by their index, into `out`. `done` is told of each frame that is finished, in
+/// any of the passes, as a part of the whole.
+///
+/// # Errors
+/// If a frame cannot be loaded or encoded, a channel that is asked for by name is in none, the file that frames are added to is damaged, or the new one not written.
+pub fn pack_with<E: Send, W: Write + Seek>(
+    surroundings: Surroundings,
+    frames: &[FrameName],
+    load: impl Fn(usize) -> Result<Loaded, E> + Sync,
+    out: W,
+    options: &Options,
+    frame_rate: Option<f64>,
+    done: &mut dyn FnMut(f64),
+) -> Result<(Report, Plan), PackError<E>> {
+    let Surroundings { base, recipe, keep } = surroundings;
+    let passes = if options.is_weighed() { 3 } else { 2 };
     let mut finished = 0;
     let mut tell = |count: usize| {
         finished += count;
@@ -68,14 +98,74 @@ pub fn pack<E: Send, W: Write + Seek>(
     };
     // What the passes keep of each frame for the next.
     let mut kept: Vec<Kept> = frames.iter().map(|_| Kept::default()).collect();
-    let mut kept_bytes = 0;
-    let loaded = |kept: &Kept, frame: usize| match &kept.loaded {
+    let plan = match keep.and_then(|keep| work::plan(&(keep.load)(work::PLAN)?)) {
+        Some(plan) => {
+            tell((passes - 1) * frames.len());
+            plan
+        }
+        None => {
+            let plan = survey(base, &load, &mut kept, options, &mut tell)?;
+            if let Some(keep) = keep {
+                (keep.save)(work::PLAN, &work::plan_bytes(&plan));
+            }
+            plan
+        }
+    };
+    let compress = |bytes: &[u8]| compress(bytes);
+    let mut assembler = match base {
+        Some(base) => Assembler::onto(out, &compress, base, &plan, options)?,
+        None => Assembler::new(out, &compress, &plan, options, frame_rate)?,
+    };
+    if let Some(recipe) = recipe {
+        assembler.note_recipe(recipe.digest);
+    }
+    for window in windows(frames.len()) {
+        let encoded = each(window.len(), |i| -> Result<EncodedFrame, PackError<E>> {
+            let frame = window.start + i;
+            let name = work::frame_name(frame);
+            if let Some(encoded) = keep.and_then(|keep| work::frame(&(keep.load)(&name)?, &plan)) {
+                return Ok(encoded);
+            }
+            let (grids, metadata) = loaded(&load, &kept[frame], frame)?;
+            let encoded = encode_frame(&grids, &metadata, &plan, options, kept[frame].weighed.as_deref())?;
+            if let Some(keep) = keep {
+                (keep.save)(&name, &work::frame_bytes(&encoded));
+            }
+            Ok(encoded)
+        });
+        for (frame, encoded) in window.clone().zip(encoded) {
+            let FrameName { number, name } = &frames[frame];
+            let source = recipe.and_then(|recipe| recipe.sources.get(frame).copied());
+            assembler.add(&encoded?, *number, name, source)?;
+            kept[frame] = Kept::default();
+        }
+        tell(window.len());
+    }
+    Ok((assembler.finish()?, plan))
+}
+
+fn loaded<E>(
+    load: &impl Fn(usize) -> Result<Loaded, E>,
+    kept: &Kept,
+    frame: usize,
+) -> Result<Loaded, PackError<E>> {
+    match &kept.loaded {
         Some(loaded) => Ok(loaded.clone()),
         None => load(frame).map_err(PackError::Load),
-    };
+    }
+}
 
+/// Goes through all frames for their plan, and keeps of them what fits.
+fn survey<E: Send>(
+    base: Option<&Asset>,
+    load: &(impl Fn(usize) -> Result<Loaded, E> + Sync),
+    kept: &mut [Kept],
+    options: &Options,
+    tell: &mut impl FnMut(usize),
+) -> Result<Plan, PackError<E>> {
     let mut plan = Plan::default();
-    for window in windows(frames.len()) {
+    let mut kept_bytes = 0;
+    for window in windows(kept.len()) {
         let looked = each(window.len(), |i| -> Result<(Plan, Loaded), PackError<E>> {
             let loaded = load(window.start + i).map_err(PackError::Load)?;
             let mut plan = Plan::default();
@@ -93,17 +183,22 @@ pub fn pack<E: Send, W: Write + Seek>(
         }
         tell(window.len());
     }
-    options.apply(&mut plan)?;
+    let applied = options.apply(&mut plan);
+    match base {
+        Some(base) => append::settle(base.contents(), &mut plan),
+        // Frames that are added need not have all channels that were asked for.
+        None => applied?,
+    }
     // Shapes are found in what is at hand: all frames, or the first of a long sequence.
     let samples: Vec<&[Grid]> =
         kept.iter().filter_map(|kept| Some(kept.loaded.as_ref()?.0.as_slice())).collect();
     find_shapes(&samples, &mut plan, options);
-    if is_weighed {
+    if options.is_weighed() {
         let mut sums: Vec<Totals> = plan.channels.iter().map(|_| Totals::default()).collect();
-        for window in windows(frames.len()) {
+        for window in windows(kept.len()) {
             let weighed = each(window.len(), |i| -> Result<_, PackError<E>> {
                 let frame = window.start + i;
-                Ok(weigh_frame(&loaded(&kept[frame], frame)?.0, &plan, options)?)
+                Ok(weigh_frame(&loaded(load, &kept[frame], frame)?.0, &plan, options)?)
             });
             for (frame, weighed) in window.clone().zip(weighed) {
                 let weighed = weighed?;
@@ -118,21 +213,7 @@ pub fn pack<E: Send, W: Write + Seek>(
             channel.lambda = settle(&sum, channel, options);
         }
     }
-    let compress = |bytes: &[u8]| compress(bytes);
-    let mut assembler = Assembler::new(out, &compress, &plan, options, frame_rate)?;
-    for window in windows(frames.len()) {
-        let encoded = each(window.len(), |i| -> Result<EncodedFrame, PackError<E>> {
-            let frame = window.start + i;
-            let (grids, metadata) = loaded(&kept[frame], frame)?;
-            Ok(encode_frame(&grids, &metadata, &plan, options, kept[frame].weighed.as_deref())?)
-        });
-        for (frame, encoded) in window.clone().zip(encoded) {
-            assembler.add(&encoded?, frames[frame].number, &frames[frame].name)?;
-            kept[frame] = Kept::default();
-        }
-        tell(window.len());
-    }
-    Ok((assembler.finish()?, plan))
+    Ok(plan)
 }
 
 /// What the passes keep of a frame: its grids, and the curves of their bricks.

@@ -13,6 +13,46 @@ pub struct Contents {
     pub channels: Vec<ChannelInfo>,
     /// The frames in order.
     pub frames: Vec<Frame>,
+    /// What the writer was asked for, if it says so: frames that are added later are to meet it too.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub asked: Option<Asked>,
+    /// A digest of all that the writer made the file by, apart from its sources; only the writer knows of what.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub recipe: Option<String>,
+}
+
+/// What a writer was asked for.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Asked {
+    /// Of all channels.
+    pub all: AskedOfChannel,
+    /// Of the channels of single grids, by the grid's name: if it asks for size or error, in place of what is asked of all.
+    pub channels: Vec<(String, AskedOfChannel)>,
+    /// How many coarser levels at most.
+    pub coarser_levels: u32,
+    /// How many shapes a channel's bricks share at most.
+    pub shapes: u32,
+}
+
+/// What a writer was asked for, of a channel.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct AskedOfChannel {
+    /// The largest error, in a channel's own numbers.
+    pub max_error: Option<f32>,
+    /// The largest error, as a part of a channel's peak.
+    pub max_error_of_peak: Option<f32>,
+    /// The ratio of peak to noise, in decibels.
+    pub psnr: Option<f64>,
+    /// The most bits per voxel of bricks that are not constant.
+    pub bits_per_voxel: Option<f64>,
+    /// The tag of the one codec that all bricks were to have.
+    pub codec: Option<u8>,
+    /// What the values mean, if not what the writer takes them for.
+    pub role: Option<Role>,
+    /// The unit that the values are measured in.
+    pub physical_unit: Option<String>,
 }
 
 /// What the values of a channel are, and how exact.
@@ -38,6 +78,20 @@ pub struct ChannelInfo {
     pub asked_max_error: Option<f32>,
     /// The ratio of peak to noise that was asked for, in decibels.
     pub asked_psnr: Option<f64>,
+    /// What the encoder settled on, if the writer says so.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub encoding: Option<Encoding>,
+}
+
+/// What the encoder of a channel settled on: with it, equal bricks of frames that are added later get equal words.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Encoding {
+    /// The weight of a squared error of 1, in units of the channel, in words.
+    pub lambda: f64,
+    /// The smallest and the largest value that it counted with. The peak may have grown since, up to the unit.
+    pub range: [f32; 2],
+    /// The bricks of the sources that are not constant.
+    pub source_bricks: u64,
 }
 
 /// What the values of a channel mean.
@@ -107,6 +161,9 @@ pub struct Frame {
     pub name: String,
     /// Its grids.
     pub grids: Vec<FrameGrid>,
+    /// A digest of its source, if the writer took one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub source: Option<String>,
 }
 
 /// One channel at one moment.
@@ -150,16 +207,21 @@ impl Contents {
         for channel in &self.channels {
             let is_power = channel.unit.is_normal() && channel.unit > 0.0 && channel.unit.to_bits() << 9 == 0;
             let floats = [channel.floor, channel.peak, channel.quality.max_error];
-            let doubles = [Some(channel.quality.squared_error), channel.asked_psnr];
+            let lambda = channel.encoding.map(|encoding| encoding.lambda);
+            let doubles = [Some(channel.quality.squared_error), channel.asked_psnr, lambda];
             let asked = channel.asked_max_error.is_none_or(f32::is_finite);
             if !is_power {
                 return Some(format!("channel {:?} has a unit that is no power of two", channel.name));
             }
-            if !floats.into_iter().all(f32::is_finite)
+            let range = channel.encoding.map_or([0.0; 2], |encoding| encoding.range);
+            if !floats.into_iter().chain(range).all(f32::is_finite)
                 || !doubles.into_iter().flatten().all(f64::is_finite)
                 || !asked
             {
                 return Some(format!("channel {:?} has a number that is not finite", channel.name));
+            }
+            if range.iter().any(|value| value.abs() > channel.unit) {
+                return Some(format!("channel {:?} has a range beyond its unit", channel.name));
             }
             if channel.component.is_some_and(|component| component > 2) {
                 return Some(format!("channel {:?} is a component beyond the third", channel.name));

@@ -3,6 +3,7 @@
 //! What the bytes of a chunk mean, once decompressed, is not known here. All numbers are little-endian; `docs/format.md`
 //! is the specification.
 
+use std::borrow::Cow;
 use std::io::Read;
 
 use ruzstd::decoding::{BlockDecodingStrategy, FrameDecoder};
@@ -249,7 +250,7 @@ pub fn reseal(file: &mut [u8]) {
     file[HEADER_BYTES - 8..HEADER_BYTES].copy_from_slice(&checksum.to_le_bytes());
 }
 
-fn range(source: &dyn ReadAt, offset: u64, len: u64) -> Result<std::borrow::Cow<'_, [u8]>, FormatError> {
+fn range(source: &dyn ReadAt, offset: u64, len: u64) -> Result<Cow<'_, [u8]>, FormatError> {
     let len =
         usize::try_from(len).map_err(|_| FormatError::malformed(offset, "a chunk larger than memory"))?;
     let bytes = source.range(offset, len)?;
@@ -259,26 +260,40 @@ fn range(source: &dyn ReadAt, offset: u64, len: u64) -> Result<std::borrow::Cow<
     }
 }
 
+fn damaged(row: &Row, what: &str) -> FormatError {
+    let name = row.kind.map(Kind::letters).unwrap_or_default();
+    FormatError::malformed(row.offset, format!("chunk {} {what}", name.escape_ascii()))
+}
+
+/// The stored bytes of a chunk. The caller has made sure of the memory.
+pub(super) fn read_stored<'a>(source: &'a dyn ReadAt, row: &Row) -> Result<Cow<'a, [u8]>, FormatError> {
+    let stored = range(source, row.offset, row.stored_bytes)?;
+    match xxh3_64(&stored) == row.checksum {
+        true => Ok(stored),
+        false => Err(damaged(row, "is damaged: its checksum is another")),
+    }
+}
+
 /// The decompressed bytes of a chunk. The caller has made sure of the memory for the stored and the decoded bytes.
 pub(super) fn read_chunk(source: &dyn ReadAt, row: &Row) -> Result<Vec<u8>, FormatError> {
-    let name = row.kind.map(Kind::letters).unwrap_or_default();
-    let name = name.escape_ascii();
-    let damaged = |what: &str| FormatError::malformed(row.offset, format!("chunk {name} {what}"));
+    let stored = read_stored(source, row)?;
+    Ok(decode_chunk(&stored, row)?.into_owned())
+}
+
+/// The decompressed bytes of a chunk from its stored ones.
+pub(super) fn decode_chunk<'a>(stored: &'a [u8], row: &Row) -> Result<Cow<'a, [u8]>, FormatError> {
     let fits = match row.is_compressed {
         true => row.decoded_bytes <= row.stored_bytes.saturating_mul(MAX_EXPANSION),
         false => row.decoded_bytes == row.stored_bytes,
     };
     if !fits {
-        return Err(damaged("cannot have the size that the table says"));
-    }
-    let stored = range(source, row.offset, row.stored_bytes)?;
-    if xxh3_64(&stored) != row.checksum {
-        return Err(damaged("is damaged: its checksum is another"));
+        return Err(damaged(row, "cannot have the size that the table says"));
     }
     if !row.is_compressed {
-        return Ok(stored.into_owned());
+        return Ok(Cow::Borrowed(stored));
     }
-    decompress(&stored, row.decoded_bytes).ok_or_else(|| damaged("cannot be decompressed"))
+    let decoded = decompress(stored, row.decoded_bytes);
+    decoded.map(Cow::Owned).ok_or_else(|| damaged(row, "cannot be decompressed"))
 }
 
 /// Decompresses one Zstandard frame that must give so many bytes. Memory is taken as they come.

@@ -18,7 +18,7 @@ pub mod read;
 pub mod source;
 pub mod write;
 
-pub use contents::{ChannelInfo, Contents, Frame, FrameGrid, Quality, Role};
+pub use contents::{Asked, AskedOfChannel, ChannelInfo, Contents, Encoding, Frame, FrameGrid, Quality, Role};
 pub use error::{FormatError, Limits};
 pub use layout::{Kind, reseal};
 pub use read::{Asset, MemoryBytes};

@@ -1,5 +1,6 @@
 //! Reading: an asset is opened without its pages, which come as they are needed.
 
+use std::borrow::Cow;
 use std::ops::Range;
 
 use super::contents::Contents;
@@ -31,6 +32,13 @@ struct File {
     pages: Vec<Row>,
     /// The memory of all that is not bricks.
     other_bytes: u64,
+}
+
+/// A page as it stands in its file, and its words.
+pub(super) struct StoredPage<'a> {
+    pub(super) row: Row,
+    pub(super) stored: Cow<'a, [u8]>,
+    pub(super) words: Vec<u32>,
 }
 
 /// The memory that an asset takes.
@@ -238,10 +246,13 @@ impl Asset {
     /// # Errors
     /// If there is no such page, the source fails, the page is damaged, or memory runs out.
     pub fn read_page(&self, page: usize) -> Result<Vec<u32>, FormatError> {
-        let file = self.file.as_ref();
-        let (file, page, row) = file
-            .and_then(|file| Some((file, self.store.pages().get(page)?, file.pages.get(page)?)))
-            .ok_or_else(|| FormatError::Misuse(format!("page {page} does not stand in a file")))?;
+        Ok(self.read_stored_page(page)?.words)
+    }
+
+    /// A page as it is stored, and its words.
+    pub(super) fn read_stored_page(&self, page: usize) -> Result<StoredPage<'_>, FormatError> {
+        let (file, row) = self.page_row(page)?;
+        let page = &self.store.pages()[page];
         let word_bytes = 4 * u64::from(page.word_count);
         let terms = [
             file.other_bytes,
@@ -252,9 +263,29 @@ impl Asset {
         ];
         file.limits.check(&terms, "loading bricks")?;
         let codecs = &self.store.codecs()[page.bricks()];
-        let bytes = layout::read_chunk(&*file.source, row)?;
-        let words = page::decode(codecs, &bytes);
-        words.ok_or_else(|| FormatError::malformed(row.offset, "a page of other bricks than the codecs say"))
+        let stored = layout::read_stored(&*file.source, row)?;
+        let words = page::decode(codecs, &layout::decode_chunk(&stored, row)?);
+        let damaged = || FormatError::malformed(row.offset, "a page of other bricks than the codecs say");
+        Ok(StoredPage { row: *row, words: words.ok_or_else(damaged)?, stored })
+    }
+
+    fn page_row(&self, page: usize) -> Result<(&File, &Row), FormatError> {
+        let found = self.file.as_ref().and_then(|file| Some((file, file.pages.get(page)?)));
+        found
+            .filter(|_| page < self.store.pages().len())
+            .ok_or_else(|| FormatError::Misuse(format!("page {page} does not stand in a file")))
+    }
+
+    /// Holds the stored bytes of all pages against their checksums, without decoding them.
+    ///
+    /// # Errors
+    /// If the source fails or a page is damaged.
+    pub fn check_pages(&self) -> Result<(), FormatError> {
+        (0..self.store.pages().len()).try_for_each(|page| {
+            let (file, row) = self.page_row(page)?;
+            file.limits.check(&[file.other_bytes, row.stored_bytes], "checking bricks")?;
+            layout::read_stored(&*file.source, row).map(drop)
+        })
     }
 
     /// Makes a page present.

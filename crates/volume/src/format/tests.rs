@@ -59,6 +59,7 @@ fn parts(brick_count: usize) -> (Contents, Trees, BrickStore) {
             world_from_index: Some([0.1, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 0.1, 1e-300, -7.0, 1.0 / 3.0]),
             source_header: vec![number as u8; number as usize],
         }],
+        source: Some(format!("{number:032x}")),
     };
     let contents = Contents {
         frame_rate: Some(24.0),
@@ -73,8 +74,15 @@ fn parts(brick_count: usize) -> (Contents, Trees, BrickStore) {
             quality: Quality { max_error: 0.1, squared_error: 1.0 / 3.0, voxels: u64::MAX },
             asked_max_error: Some(0.1),
             asked_psnr: None,
+            encoding: Some(Encoding { lambda: 1e300 / 3.0, range: [-0.1, 2.0], source_bricks: u64::MAX }),
         }],
         frames: vec![frame(0, levels[0]), frame(7, levels[1])],
+        asked: Some(Asked {
+            all: AskedOfChannel { max_error: Some(0.1), psnr: Some(1.0 / 3.0), ..AskedOfChannel::default() },
+            channels: vec![("flame".into(), AskedOfChannel { codec: Some(3), ..AskedOfChannel::default() })],
+            ..Asked::default()
+        }),
+        recipe: Some("recipe".to_owned()),
     };
     (contents, packer.finish(), store)
 }
@@ -106,6 +114,35 @@ fn what_is_written_is_read() {
         let bytes = file(count);
         assert_eq!(bytes, file(count), "the same bytes again");
         assert_eq!(read_all(bytes), Some(parts(count)), "{count} bricks");
+    }
+}
+
+#[test]
+fn pages_are_copied_as_they_are() {
+    let asset = Asset::open(file(2000)).unwrap();
+    assert!(asset.check_pages().is_ok());
+    let mut out = Cursor::new(Vec::new());
+    let mut writer = Writer::new(&mut out, &compress).unwrap();
+    let mut rest = asset.store().shape_words();
+    for codec in asset.store().shape_codecs() {
+        let words = rest.split_off(..codec.word_count()).unwrap();
+        writer.shape(*codec, words).unwrap();
+    }
+    for page in 0..asset.store().pages().len() {
+        let (words, offset) = writer.copy_page(&asset, page).unwrap();
+        assert_eq!((offset, words), (asset.store().pages()[page].first_word, asset.read_page(page).unwrap()));
+    }
+    // Bricks behind a copied page go to another, in the file that the first frames are in as well.
+    let end = writer.brick(Codec::F16, &[0; 256]).unwrap();
+    assert_eq!(end, asset.store().offset(2000));
+    writer.copy_page(&asset, 0).unwrap();
+    writer.finish(asset.contents(), asset.trees()).unwrap();
+    let mut copied = Asset::open(out.into_inner()).unwrap();
+    assert_eq!((copied.contents(), copied.trees()), (asset.contents(), asset.trees()));
+    assert!(copied.store().codecs().starts_with(asset.store().codecs()));
+    copied.load_all().unwrap();
+    for page in 0..asset.store().pages().len() {
+        assert_eq!(copied.store().pages()[page].words(), Some(&asset.read_page(page).unwrap()[..]));
     }
 }
 

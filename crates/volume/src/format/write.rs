@@ -10,6 +10,7 @@ use xxhash_rust::xxh3::xxh3_64;
 use super::contents::Contents;
 use super::error::FormatError;
 use super::layout::{self, HEADER_BYTES, Kind, Row};
+use super::read::Asset;
 use super::{arrays, check, page};
 use crate::codec::Codec;
 use crate::packed::Trees;
@@ -80,6 +81,24 @@ impl<'a, W: Write + Seek> Writer<'a, W> {
         self.store.push_shape(codec, words).map_err(misuse)
     }
 
+    /// Adds all bricks of a page of another file, whose stored bytes are taken as they are. Its shapes have been added,
+    /// in the same order. Gives the words, and the offset of the first.
+    ///
+    /// # Errors
+    /// If the sink fails, there is no such page, it is damaged, or there are too many words.
+    pub fn copy_page(&mut self, from: &Asset, page: usize) -> Result<(Vec<u32>, u32), FormatError> {
+        let copied = from.read_stored_page(page)?;
+        let codecs = &from.store().codecs()[from.store().pages()[page].bricks()];
+        self.write_page()?;
+        let offset = self.store.offset(self.store.codecs().len());
+        let first_brick = self.store.push_page(codecs, &copied.words).map_err(misuse)?;
+        self.store.drop_page(self.written_pages);
+        self.written_pages += 1;
+        let row = Row { offset: self.at, bricks: [first_brick, copied.row.bricks[1]], ..copied.row };
+        self.chunk_as_it_is(row, &copied.stored)?;
+        Ok((copied.words, offset))
+    }
+
     /// The words of all shapes that were added, from which their offsets count.
     pub fn shape_words(&self) -> &[u32] {
         self.store.shape_words()
@@ -104,9 +123,13 @@ impl<'a, W: Write + Seek> Writer<'a, W> {
         let checksum = xxh3_64(stored);
         let kind = Some(kind);
         let row = Row { kind, is_compressed, offset: self.at, stored_bytes, decoded_bytes, checksum, bricks };
+        self.chunk_as_it_is(row, stored)
+    }
+
+    fn chunk_as_it_is(&mut self, row: Row, stored: &[u8]) -> Result<(), FormatError> {
         self.out.write_all(stored)?;
+        self.at += row.stored_bytes;
         self.rows.push(row);
-        self.at += stored_bytes;
         Ok(())
     }
 

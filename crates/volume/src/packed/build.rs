@@ -39,6 +39,27 @@ pub struct EntryScale {
 }
 
 impl Packer {
+    /// Goes on behind trees that are there, which have been checked: what they hold is not stored again.
+    pub fn onto(trees: Trees) -> Packer {
+        let mut packer = Packer::default();
+        let mut keys = [HashMap::new(), HashMap::new()];
+        for ((nodes, slots), keys) in
+            [(&trees.node5s, NODE5_SLOTS), (&trees.node4s, NODE4_SLOTS)].into_iter().zip(&mut keys)
+        {
+            for (index, node) in nodes.iter().enumerate() {
+                let Some(bits) = mask::decode(&trees.masks, node.mask, slots) else { continue };
+                let count = bits.iter().map(|word| word.count_ones() as usize).sum::<usize>();
+                let first = node.first_entry as usize;
+                let Some(entries) = trees.entries.get(first..first + count) else { continue };
+                // Of equal masks the first counts, and keys are made of it.
+                let mask = *packer.masks.entry(bits).or_insert(node.mask);
+                keys.entry((mask, digest(entries))).or_insert(index as u32);
+            }
+        }
+        [packer.node5s, packer.node4s] = keys;
+        Packer { trees, ..packer }
+    }
+
     /// Adds a tree. Its values are those of the source less the background; `bricks` says where each of its bricks
     /// stands in the brick store, and `constant` gives the exact value of a constant entry from the one in the tree.
     ///
@@ -129,7 +150,7 @@ impl Packer {
                     begin
                 }
             };
-            let key = (mask, xxhash_rust::xxh3::xxh3_128(bytemuck::cast_slice(&entries)));
+            let key = (mask, digest(&entries));
             let first_entry = to_index(self.trees.entries.len())?;
             if !known.contains_key(&key) && new_keys.insert(key) {
                 self.trees.entries.extend(entries);
@@ -139,6 +160,10 @@ impl Packer {
         to_index(self.trees.entries.len())?;
         Ok(added)
     }
+}
+
+fn digest(entries: &[Entry]) -> u128 {
+    xxhash_rust::xxh3::xxh3_128(bytemuck::cast_slice(entries))
 }
 
 /// Adds the nodes that are new. Gives the index of each.
@@ -206,6 +231,10 @@ mod tests {
             let size = packer.trees().size_bytes();
             let again = packer.add(&tree, &bricks, scale, |value| value + background).unwrap();
             prop_assert_eq!(packer.trees().size_bytes(), size + 20 * tree.root.len(), "a frame that repeats costs its root");
+            let mut further = Packer::onto(packer.trees().clone());
+            further.add(&tree, &bricks, scale, |value| value + background).unwrap();
+            let grown = packer.trees().size_bytes() + 20 * tree.root.len();
+            prop_assert_eq!(further.trees().size_bytes(), grown, "so it does behind trees that were there before");
             let trees = packer.finish();
             let in_store = |codec: Codec, offset: u32| codec == Codec::F32 && (offset as usize) < 512 * bricks.len();
             prop_assert_eq!(trees.check(in_store), Ok(()));

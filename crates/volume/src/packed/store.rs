@@ -193,6 +193,25 @@ impl BrickStore {
         Ok(offset)
     }
 
+    /// Adds bricks as a page of their own, whose words are all there. Gives the number of the first.
+    ///
+    /// # Errors
+    /// If there is no brick, the words are not those of these bricks, a shape is not there, or the store is full; the
+    /// store is then of no more use.
+    pub fn push_page(&mut self, codecs: &[Codec], words: &[u32]) -> Result<u32, StoreError> {
+        let (first_brick, first_word) = (self.bricks.codecs.len() as u32, self.bricks.word_count);
+        for codec in codecs {
+            self.bricks.push(*codec)?;
+        }
+        if codecs.is_empty() {
+            return Err(StoreError::Pages);
+        }
+        let (brick_count, word_count) = (codecs.len() as u32, self.bricks.word_count - first_word);
+        self.pages.push(Page { first_brick, brick_count, first_word, word_count, words: None });
+        self.set_page(self.pages.len() - 1, words.to_vec())?;
+        Ok(first_brick)
+    }
+
     /// Adds a shape. Gives its offset in the shape store.
     ///
     /// # Errors
