@@ -302,6 +302,10 @@ pub(crate) fn run(
         Ok((report, plan, verified))
     });
     bar.finish_and_clear();
+    if matches!(written, Err(PackFailure::Verify(_))) {
+        // Taken up again, it would be as wrong.
+        work.iter().for_each(Work::remove);
+    }
     let (report, plan, verified) = written.map_err(|failure| match failure {
         PackFailure::Output(error) => Failure::file(output, error.to_string()),
         PackFailure::Pack(PackError::Load(failure)) | PackFailure::Verify(failure) => failure,
