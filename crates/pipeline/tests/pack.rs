@@ -1,7 +1,6 @@
 //! Packed volumes as a sceptic takes them: what was asked for is what is measured, on trees of every kind.
 //!
-//! Everything is in memory; each source grid is compared with what comes back, voxel by voxel, by code that knows
-//! nothing of how it was encoded.
+//! Everything is in memory; each source grid is compared with what comes back by code that knows not how it was encoded.
 
 use std::collections::BTreeSet;
 use std::convert::Infallible;
@@ -790,8 +789,8 @@ fn bricks_that_are_alike_share_a_shape() {
 #[test]
 fn the_ratio_holds_for_values_whose_squares_vanish() {
     let options = Options { psnr: Some(45.0), ..NOTHING };
-    let strengths = (0..20).map(|brick| brick as f32 * 0.1);
-    let packed = check(&still(vec![grid("density", waves(strengths, 1e-30))]), &options);
+    let tree = waves((0..20).map(|brick| brick as f32 * 0.1), 1e-30);
+    let packed = check(&still(vec![grid("density", tree)]), &options);
     assert!(packed.report.brick_bytes > 0);
 }
 
