@@ -145,7 +145,7 @@ impl<'c, W: Write + Seek> Assembler<'c, W> {
     /// If nothing can be written.
     pub fn new(
         out: W,
-        compress: &'c dyn Fn(&[u8]) -> Vec<u8>,
+        compress: &'c (dyn Fn(&[u8]) -> Vec<u8> + Sync),
         plan: &Plan,
         options: &Options,
         frame_rate: Option<f64>,
@@ -178,7 +178,7 @@ impl<'c, W: Write + Seek> Assembler<'c, W> {
     /// If nothing can be written, or the other file is damaged.
     pub fn onto(
         out: W,
-        compress: &'c dyn Fn(&[u8]) -> Vec<u8>,
+        compress: &'c (dyn Fn(&[u8]) -> Vec<u8> + Sync),
         base: &Asset,
         plan: &Plan,
         options: &Options,

@@ -5,6 +5,7 @@
 //! digest of each brick. What comes out does not depend on the number of threads.
 
 use std::io::{Seek, Write};
+use std::ops::Range;
 
 use nuage_vdb::{Grid, Metadata};
 use nuage_volume::format::Asset;
@@ -64,7 +65,7 @@ pub struct Surroundings<'a> {
 ///
 /// # Errors
 /// As those of [`pack_with`].
-pub fn pack<E: Send, W: Write + Seek>(
+pub fn pack<E: Send, W: Write + Seek + Send>(
     frames: &[FrameName],
     load: impl Fn(usize) -> Result<Loaded, E> + Sync,
     out: W,
@@ -80,7 +81,7 @@ pub fn pack<E: Send, W: Write + Seek>(
 ///
 /// # Errors
 /// If a frame cannot be loaded or encoded, a channel that is asked for by name is in none, the file that frames are added to is damaged, or the new one not written.
-pub fn pack_with<E: Send, W: Write + Seek>(
+pub fn pack_with<E: Send, W: Write + Seek + Send>(
     surroundings: Surroundings,
     frames: &[FrameName],
     load: impl Fn(usize) -> Result<Loaded, E> + Sync,
@@ -119,8 +120,10 @@ pub fn pack_with<E: Send, W: Write + Seek>(
     if let Some(recipe) = recipe {
         assembler.note_recipe(recipe.digest);
     }
-    for window in windows(frames.len()) {
-        let encoded = each(window.len(), |i| -> Result<EncodedFrame, PackError<E>> {
+    // While some frames are encoded, those before them are put into the file.
+    let mut before: (Range<usize>, Vec<Result<EncodedFrame, PackError<E>>>) = (0..0, Vec::new());
+    for window in windows(frames.len()).chain(std::iter::once(0..0)) {
+        let encode = |i: usize| -> Result<EncodedFrame, PackError<E>> {
             let frame = window.start + i;
             let name = work::frame_name(frame);
             if let Some(encoded) = keep.and_then(|keep| work::frame(&(keep.load)(&name)?, &plan)) {
@@ -132,14 +135,21 @@ pub fn pack_with<E: Send, W: Write + Seek>(
                 (keep.save)(&name, &work::frame_bytes(&encoded));
             }
             Ok(encoded)
-        });
-        for (frame, encoded) in window.clone().zip(encoded) {
-            let FrameName { number, name } = &frames[frame];
-            let source = recipe.and_then(|recipe| recipe.sources.get(frame).copied());
-            assembler.add(&encoded?, *number, name, source)?;
-            kept[frame] = Kept::default();
-        }
-        tell(window.len());
+        };
+        let (done, encoded_before) = before;
+        let add = || -> Result<(), PackError<E>> {
+            for (frame, encoded) in done.clone().zip(encoded_before) {
+                let FrameName { number, name } = &frames[frame];
+                let source = recipe.and_then(|recipe| recipe.sources.get(frame).copied());
+                assembler.add(&encoded?, *number, name, source)?;
+            }
+            Ok(())
+        };
+        let (encoded, added) = both(|| each(window.len(), encode), add);
+        added?;
+        kept[window.clone()].fill_with(Kept::default);
+        tell(done.len());
+        before = (window, encoded);
     }
     Ok((assembler.finish()?, plan))
 }
@@ -216,6 +226,18 @@ fn survey<E: Send>(
     Ok(plan)
 }
 
+/// Does two things, at the same time where the feature `parallel` says so.
+fn both<A: Send, B: Send>(a: impl FnOnce() -> A + Send, b: impl FnOnce() -> B + Send) -> (A, B) {
+    #[cfg(feature = "parallel")]
+    {
+        rayon::join(a, b)
+    }
+    #[cfg(not(feature = "parallel"))]
+    {
+        (a(), b())
+    }
+}
+
 /// What the passes keep of a frame: its grids, and the curves of their bricks.
 #[derive(Default)]
 struct Kept {
@@ -243,7 +265,7 @@ pub fn compress(bytes: &[u8]) -> Vec<u8> {
 }
 
 /// The frames by as many as are worked on at once.
-fn windows(count: usize) -> impl Iterator<Item = std::ops::Range<usize>> {
+fn windows(count: usize) -> impl Iterator<Item = Range<usize>> {
     #[cfg(feature = "parallel")]
     let width = rayon::current_num_threads().max(1);
     #[cfg(not(feature = "parallel"))]

@@ -18,7 +18,7 @@ use crate::packed::store::{BrickStore, PAGE_WORDS, StoreError};
 
 /// Makes one Zstandard frame of bytes, or nothing if it cannot: they are then stored as they are. Its window must not
 /// exceed the larger of 8 MiB and the bytes given.
-pub type Compress<'a> = dyn Fn(&[u8]) -> Vec<u8> + 'a;
+pub type Compress<'a> = dyn Fn(&[u8]) -> Vec<u8> + Sync + 'a;
 
 /// Where the bytes of a file went.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
