@@ -325,6 +325,28 @@ fn the_number_of_threads_does_not_show() {
     assert!(files[0] == files[1] && files[0] == files[2]);
 }
 
+/// Paths that scatter once show what the ray marcher shows, but for noise; those that scatter more are brighter.
+#[test]
+fn paths_show_what_marching_shows_and_light_that_scatters_on() {
+    let folder = tempfile::tempdir().unwrap();
+    let mean = |options: &str| {
+        let path = folder.path().join("out.exr");
+        let options = format!("--size 48 --background none --overwrite --exr-float {options}");
+        done(&render(&blast("blast.0006.vdb"), &path, &options));
+        let (_, _, pixels) = exr(&path);
+        let count = pixels.len() as f32;
+        std::array::from_fn::<f32, 4, _>(|i| pixels.iter().map(|pixel| pixel[i]).sum::<f32>() / count)
+    };
+    let marched = mean("--samples 4");
+    let once = mean("--integrator path --samples 64 --scatterings 1");
+    let often = mean("--integrator path --samples 64");
+    for i in 0..4 {
+        assert!((once[i] - marched[i]).abs() < 0.02 * marched[i], "{once:?} {marched:?}");
+    }
+    assert!((once[3] - often[3]).abs() < 0.01 * once[3], "{once:?} {often:?}");
+    assert!(often[..3].iter().zip(&once).all(|(often, once)| *often > 1.2 * once), "{once:?} {often:?}");
+}
+
 #[test]
 fn an_empty_grid_is_a_picture_of_the_background() {
     let folder = tempfile::tempdir().unwrap();
