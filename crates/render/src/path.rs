@@ -15,6 +15,7 @@ use crate::blocks::Blocks;
 use crate::camera::Ray;
 use crate::hash::{hash_u32, unit_f32};
 use crate::march::Radiance;
+use crate::math::{exp, ln};
 use crate::phase::{hg, sample_hg};
 use crate::scene::{Emission, Scene};
 use crate::traverse::{Field, Reader};
@@ -75,7 +76,7 @@ impl Random {
     /// An optical depth at which a ray collides.
     fn depth(&mut self) -> f32 {
         // Never infinite: the number is less than 1 by 2⁻²⁴ or more.
-        -(1.0 - self.unit()).ln()
+        -ln(1.0 - self.unit())
     }
 }
 
@@ -209,7 +210,7 @@ impl<'s> PathTracer<'s> {
                 ratio *= (1.0 - (density - segment.min) / residual).max(0.0);
                 depth = random.depth();
             }
-            let passes = ratio * (-known).exp();
+            let passes = ratio * exp(-known);
             if passes < ROULETTE_TRANSMITTANCE {
                 if random.unit() * ROULETTE_TRANSMITTANCE >= passes {
                     return 0.0;
@@ -217,7 +218,7 @@ impl<'s> PathTracer<'s> {
                 (ratio, known) = (ROULETTE_TRANSMITTANCE, 0.0);
             }
         }
-        ratio * (-known).exp()
+        ratio * exp(-known)
     }
 
     /// What the medium emits along a ray up to a distance. As a path gets beyond a point with the chance of the transmittance up to
