@@ -90,7 +90,7 @@ pub fn ln(x: f32) -> f32 {
     let s2 = s * s;
     let series = s2 * (1.0 / 3.0 + s2 * (1.0 / 5.0 + s2 * (1.0 / 7.0 + s2 * (1.0 / 9.0))));
     // ln 2 in two parts, of which the first times an exponent is exact.
-    let (high, low) = (0.693_359_375, -2.121_944_4e-4);
+    let (high, low) = (355.0 / 512.0, -2.121_944_4e-4);
     exponent * high + (2.0 * s + (2.0 * s * series + exponent * low))
 }
 
