@@ -664,6 +664,19 @@ fn bricks_that_are_alike_share_a_shape() {
     }
 }
 
+/// A codec that is asked for one channel is taken there although others are weighed.
+#[test]
+fn a_codec_for_one_channel_is_taken_beside_a_ratio_for_others() {
+    let waves = |name| grid(name, waves((0..20).map(|brick| 0.3 + brick as f32 * 0.05), 1.0));
+    let codec = Codec::Block { format: BlockFormat::Bc4, axis: PackingAxis::X };
+    let asked = ChannelOptions { codec: Some(codec), psnr: Some(70.0), ..ChannelOptions::default() };
+    let options = Options { psnr: Some(40.0), channels: vec![("heat".into(), asked)], ..NOTHING };
+    let packed = packed(&still(vec![waves("density"), waves("heat")]), &options);
+    let codecs = packed.asset.store().codecs();
+    assert_eq!(codecs.iter().filter(|found| **found == codec).count(), 20, "{codecs:?}");
+    assert!(codecs.len() > 20, "density has bricks of its own: {codecs:?}");
+}
+
 #[test]
 fn the_ratio_holds_for_values_whose_squares_vanish() {
     let options = Options { psnr: Some(45.0), ..NOTHING };

@@ -290,7 +290,7 @@ pub struct WeighedChannel {
     pub channel: usize,
     /// The sums over its bricks.
     pub totals: Totals,
-    /// The codecs worth choosing for each brick, with any λ that may come out.
+    /// The codecs worth choosing for each brick, with any λ that may come out; none where one codec is asked for.
     pub curves: Vec<Curve>,
 }
 
@@ -313,6 +313,9 @@ pub fn weigh_frame(
         };
         let largest = planned.before.map_or(largest, |before| largest.max(before.lambda));
         let choice = Choice::new(planned, options, largest);
+        if choice.is_forced {
+            return Ok(WeighedChannel { channel: index, totals: Totals::default(), curves: Vec::new() });
+        }
         let level = Level::of(&tree.tree, IVec3::ZERO);
         let curves = each(level.bricks.len(), |i| choice.curve(&level.bricks[i], &scale));
         // In the order of bricks, on which sums depend.
@@ -334,8 +337,8 @@ fn encode_level(
     let coded = each(level.bricks.len(), |i| {
         let brick = &level.bricks[i];
         let best = match curves {
-            Some(curves) => curves[i].at(choice.lambda),
-            None => choice.best(brick, scale),
+            Some(curves) if !choice.is_forced => curves[i].at(choice.lambda),
+            _ => choice.best(brick, scale),
         };
         let mut words = Vec::with_capacity(best.codec.word_count());
         write(brick, best.codec, scale, &choice.shapes, &mut words);
