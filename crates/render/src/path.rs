@@ -14,7 +14,6 @@ use nuage_volume::accessor::Accessor;
 use crate::blocks::Blocks;
 use crate::camera::Ray;
 use crate::hash::{hash_u32, unit_f32};
-use crate::march::Radiance;
 use crate::math::{exp, ln};
 use crate::phase::{hg, sample_hg};
 use crate::scene::{Emission, Scene};
@@ -54,6 +53,30 @@ pub struct PathTracer<'s> {
 pub struct PathWorker<'s> {
     density: Option<Reader<'s>>,
     emission: Option<Reader<'s>>,
+}
+
+/// What one path brings. Means over many paths are what the ray sees.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct PathSample {
+    /// Light that the medium gives off towards the camera.
+    pub emission: Vec3,
+    /// Light of lights that scattered once.
+    pub direct: Vec3,
+    /// Light that scattered more often, or was given off by the medium and scattered.
+    pub indirect: Vec3,
+    /// Whether the ray passed the medium.
+    pub passed: bool,
+    /// The distance of the first collision, in world lengths; 0 if the ray passed.
+    pub depth: f32,
+    /// The albedo there; 0 if the ray passed.
+    pub albedo: Vec3,
+}
+
+impl PathSample {
+    /// All light that comes along the ray.
+    pub fn light(&self) -> Vec3 {
+        self.emission + self.direct + self.indirect
+    }
 }
 
 /// Random numbers of one path.
@@ -100,27 +123,32 @@ impl<'s> PathTracer<'s> {
         }
     }
 
-    /// What one path says of the light along a ray: its mean over many seeds is the light. The transmittance is 0 or 1.
-    pub fn radiance(&self, worker: &mut PathWorker<'s>, ray: &Ray, seed: u32) -> Radiance {
+    /// What one path says of the light along a ray.
+    pub fn sample(&self, worker: &mut PathWorker<'s>, ray: &Ray, seed: u32) -> PathSample {
         let Scene { medium, sun, sky, .. } = self.scene;
         let (albedo, g) = (Vec3::from_array(medium.albedo), medium.phase_g);
         let sky = Vec3::from_array(*sky);
         let mut random = Random { path: seed, count: 0 };
-        let (mut weight, mut light) = (Vec3::ONE, Vec3::ZERO);
+        let (mut weight, mut sample) = (Vec3::ONE, PathSample::default());
         let mut ray = *ray;
         let mut scatterings = 0;
         loop {
             let collision = self.fly(worker, &ray, &mut random);
-            light += weight * self.emitted(worker, &ray, collision.unwrap_or(f64::INFINITY), &mut random);
+            let emitted =
+                weight * self.emitted(worker, &ray, collision.unwrap_or(f64::INFINITY), &mut random);
+            *(if scatterings == 0 { &mut sample.emission } else { &mut sample.indirect }) += emitted;
             let Some(distance) = collision else {
-                if scatterings == 0 {
-                    return Radiance { scattered: light, transmittance: 1.0 };
-                }
-                if !self.settings.sky_rays {
-                    light += weight * sky;
+                match scatterings {
+                    0 => sample.passed = true,
+                    _ if self.settings.sky_rays => {}
+                    1 => sample.direct += weight * sky,
+                    _ => sample.indirect += weight * sky,
                 }
                 break;
             };
+            if scatterings == 0 {
+                (sample.depth, sample.albedo) = (distance as f32, albedo);
+            }
             if self.settings.max_scatterings.is_some_and(|most| scatterings >= most) {
                 break;
             }
@@ -135,11 +163,12 @@ impl<'s> PathTracer<'s> {
             }
             let origin = ray.origin + ray.direction * distance;
             let before = ray.direction.as_vec3();
+            let mut light = Vec3::ZERO;
             if let Some(sun) = sun {
                 let towards = Ray { origin, direction: sun.direction_to.as_dvec3() };
                 let phase = hg(before.dot(sun.direction_to), g);
                 let passes = self.transmittance(worker, &towards, &mut random);
-                light += weight * Vec3::from_array(sun.irradiance) * (phase * passes);
+                light += Vec3::from_array(sun.irradiance) * (phase * passes);
             }
             let scattered = |random: &mut Random| {
                 let direction = sample_hg(before, g, [random.unit(), random.unit()]).as_dvec3();
@@ -147,11 +176,12 @@ impl<'s> PathTracer<'s> {
             };
             if self.settings.sky_rays && sky != Vec3::ZERO {
                 let towards = scattered(&mut random);
-                light += weight * sky * self.transmittance(worker, &towards, &mut random);
+                light += sky * self.transmittance(worker, &towards, &mut random);
             }
+            *(if scatterings == 1 { &mut sample.direct } else { &mut sample.indirect }) += weight * light;
             ray = scattered(&mut random);
         }
-        Radiance { scattered: light, transmittance: 0.0 }
+        sample
     }
 
     /// The distance at which a ray collides, by delta tracking. `None` if it leaves the medium.

@@ -80,9 +80,9 @@ pub fn trace<'s>(
             let number = |dimension| hash_pixel(x, y, path, hash_u32(seed).wrapping_add(dimension));
             let offset = DVec2::new(unit_f32(number(0)).into(), unit_f32(number(1)).into());
             let ray = scene.camera.ray(DVec2::new(x.into(), y.into()) + offset, width, height);
-            let light = tracer.radiance(worker, &ray, number(2));
-            let [r, g, b] = light.scattered.to_array();
-            for (i, value) in [r, g, b, 1.0 - light.transmittance].into_iter().enumerate() {
+            let sample = tracer.sample(worker, &ray, number(2));
+            let [r, g, b] = sample.light().to_array();
+            for (i, value) in [r, g, b, f32::from(!sample.passed)].into_iter().enumerate() {
                 let from_mean = f64::from(value) - mean[i];
                 mean[i] += from_mean / f64::from(path + 1);
                 spread[i] += from_mean * (f64::from(value) - mean[i]);
