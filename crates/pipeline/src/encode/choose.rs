@@ -90,21 +90,20 @@ impl Candidate {
 pub struct Curve(Vec<Candidate>);
 
 impl Curve {
-    /// Tries codecs, which are sorted by their words, as far as they can be the best with some λ up to `largest`. The
-    /// last has to hold every brick.
-    pub fn of(measure: &mut Measure, codecs: &[Codec], max_error: Option<f32>, largest: Lambda) -> Curve {
+    /// Tries codecs as far as they can be the best with some λ up to `largest`.
+    pub fn of(measure: &mut Measure, max_error: Option<f32>, largest: Lambda) -> Curve {
         let mut curve: Vec<Candidate> = Vec::new();
-        for codec in codecs {
+        for codec in measure.codecs() {
             // With a smaller λ, the best so far but gains on what takes more words.
             let words = codec.word_count() as f64;
             if curve.iter().any(|candidate| candidate.cost(largest) <= words) {
                 break;
             }
-            let Some(error) = measure.error(*codec) else { continue };
+            let Some(error) = measure.error(codec) else { continue };
             if max_error.is_some_and(|bound| error.max > bound) {
                 continue;
             }
-            let candidate = Candidate { codec: *codec, error };
+            let candidate = Candidate { codec, error };
             if curve.last().is_some_and(|last| last.error.squared <= error.squared) {
                 continue;
             }
@@ -231,7 +230,7 @@ impl Totals {
 
 #[cfg(test)]
 mod tests {
-    use super::super::quantize::{Brick, CODECS, ChannelScale};
+    use super::super::quantize::{Brick, ChannelScale};
     use super::super::shapes::Shapes;
     use super::*;
 
@@ -246,21 +245,23 @@ mod tests {
     fn bricks() -> Vec<Brick> {
         let wave =
             |i: usize, brick: usize| ((i * i * (brick + 3)) as f32 * 0.001).sin() * 0.4 / (1 + brick) as f32;
-        (0..40).map(|brick| std::array::from_fn(|i| 0.5 + wave(i, brick))).collect()
+        let empty = |i: usize, brick: usize| brick % 4 == 0 && i % (brick + 8) < brick;
+        let value = |i, brick| if empty(i, brick) { 0.0 } else { 0.5 + wave(i, brick) };
+        (0..40).map(|brick| std::array::from_fn(|i| value(i, brick))).collect()
     }
 
     fn curve(brick: &Brick, max_error: Option<f32>, largest: Lambda) -> Curve {
-        Curve::of(&mut Measure::of(brick, &SCALE, &Shapes::default()), &CODECS, max_error, largest)
+        Curve::of(&mut Measure::of(brick, &SCALE, &Shapes::default()), max_error, largest)
     }
 
     /// The least that a brick costs, tried codec by codec.
     fn least(brick: &Brick, max_error: Option<f32>, lambda: Lambda) -> f64 {
         let shapes = Shapes::default();
         let mut measure = Measure::of(brick, &SCALE, &shapes);
-        let candidates = CODECS.iter().filter_map(|codec| {
+        let candidates = measure.codecs().filter_map(|codec| {
             let error =
-                measure.error(*codec).filter(|error| max_error.is_none_or(|bound| error.max <= bound))?;
-            Some(Candidate { codec: *codec, error }.cost(lambda))
+                measure.error(codec).filter(|error| max_error.is_none_or(|bound| error.max <= bound))?;
+            Some(Candidate { codec, error }.cost(lambda))
         });
         candidates.fold(f64::INFINITY, f64::min)
     }

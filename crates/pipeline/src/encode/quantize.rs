@@ -18,6 +18,7 @@ use nuage_volume::space::BRICK_VOXELS;
 
 use super::block;
 use super::shapes::{SHAPE_CODEC, Shapes, Shared};
+use super::sparse::Sparse;
 
 /// The values of a brick.
 pub type Brick = [f32; BRICK_VOXELS];
@@ -46,8 +47,8 @@ pub struct Error {
     pub max: f32,
 }
 
-/// The codecs that are tried unless one is asked for, the cheapest first.
-pub const CODECS: [Codec; 31] = [
+/// The codecs that are tried on every brick, the cheapest first.
+const CODECS: [Codec; 31] = [
     Codec::Constant,
     Codec::Gradient { bits: 0 },
     Codec::Shared,
@@ -91,19 +92,32 @@ pub struct Measure<'a> {
     gradient: Option<(Prediction<8>, Range)>,
     /// The fitted lattice likewise.
     lattice: Option<(Prediction<LATTICE_POINTS>, Range)>,
+    /// The voxels that are there, if some are not.
+    sparse: Option<Sparse>,
 }
 
 impl<'a> Measure<'a> {
     /// Begins with a brick. `shapes` are those that it may share.
     pub fn of(values: &'a Brick, scale: &'a ChannelScale, shapes: &'a Shapes) -> Self {
         let range = Range::of_residuals(values, &NOTHING, scale);
-        Measure { values, scale, shapes, range, gradient: None, lattice: None }
+        let sparse = Sparse::of(values, scale);
+        Measure { values, scale, shapes, range, gradient: None, lattice: None, sparse }
+    }
+
+    /// The codecs to be tried unless one is asked for, the cheapest first. The last can hold any brick.
+    pub fn codecs(&self) -> impl Iterator<Item = Codec> + use<> {
+        let sparse = self.sparse.as_ref().map_or(Vec::new(), Sparse::codecs);
+        let (mut sparse, mut others) = (sparse.into_iter().peekable(), CODECS.into_iter().peekable());
+        std::iter::from_fn(move || match (sparse.peek(), others.peek()) {
+            (Some(one), Some(other)) if one.word_count() < other.word_count() => sparse.next(),
+            _ => others.next(),
+        })
     }
 
     /// The error in a codec, `None` where it cannot hold the brick: empty voxels would not stay empty, a sign would
     /// change, or no shape is like it. [`Codec::F32`] always can.
     pub fn error(&mut self, codec: Codec) -> Option<Error> {
-        let Measure { values, scale, shapes, range, ref mut gradient, ref mut lattice } = *self;
+        let Measure { values, scale, shapes, range, ref mut gradient, ref mut lattice, ref sparse } = *self;
         match codec {
             Codec::Constant => {
                 let line = Line { low: constant(values, scale), step: 0.0 };
@@ -122,6 +136,7 @@ impl<'a> Measure<'a> {
                     lattice.get_or_insert_with(|| Prediction::lattice(values, scale).ranged(values, scale));
                 lattice.error(*residuals, values, bits, scale)
             }
+            Codec::Sparse { is_fitted, pairs } => sparse.as_ref()?.error(is_fitted, pairs, scale),
             Codec::Split { bits } => {
                 quantized_error(values, &NOTHING, &Split::over(values, scale, bits).lines, bits, scale)
             }
@@ -163,7 +178,7 @@ pub fn constant(values: &Brick, scale: &ChannelScale) -> f32 {
 /// index.
 ///
 /// # Panics
-/// If the codec is [`Codec::Shared`] and no shape is like the brick.
+/// If [`Measure`] has no error for it: no shape is like the brick, or it is not sparse.
 pub fn write(values: &Brick, codec: Codec, scale: &ChannelScale, shapes: &Shapes, words: &mut Vec<u32>) {
     match codec {
         Codec::Constant => {}
@@ -174,6 +189,12 @@ pub fn write(values: &Brick, codec: Codec, scale: &ChannelScale, shapes: &Shapes
         }
         Codec::Gradient { bits } => Prediction::gradient(values, scale).write(values, bits, scale, words),
         Codec::Lattice { bits } => Prediction::lattice(values, scale).write(values, bits, scale, words),
+        Codec::Sparse { is_fitted, pairs } => {
+            let Some(sparse) = Sparse::of(values, scale) else {
+                unreachable!("a brick that was measured is sparse")
+            };
+            sparse.write(values, is_fitted, pairs, scale, words);
+        }
         Codec::F16 => {
             let half = |value: f32| u32::from(f16::from_f32(value / scale.unit).to_bits());
             let pairs = values.as_chunks::<2>().0;
@@ -266,9 +287,9 @@ fn write_block(values: &Brick, codec: Codec, scale: &ChannelScale, words: &mut V
 
 /// A line as a brick stores it.
 #[derive(Debug, Clone, Copy)]
-struct StoredLine {
-    line: Line,
-    word: u32,
+pub(super) struct StoredLine {
+    pub(super) line: Line,
+    pub(super) word: u32,
 }
 
 impl StoredLine {
@@ -305,12 +326,17 @@ fn bounds(values: impl Iterator<Item = f32>) -> (f32, f32) {
 
 /// What the values of a brick differ from a prediction.
 #[derive(Debug, Clone, Copy)]
-struct Range {
+pub(super) struct Range {
     min: f32,
     max: f32,
 }
 
 impl Range {
+    pub(super) fn of(residuals: impl Iterator<Item = f32>) -> Range {
+        let (min, max) = bounds(residuals);
+        Range { min, max }
+    }
+
     /// Voxels at the floor need a code that leads to or below it, and none above.
     fn of_residuals(values: &Brick, predicted: &Brick, scale: &ChannelScale) -> Range {
         let (mut min, mut max) = ([f32::INFINITY; ROW], [f32::NEG_INFINITY; ROW]);
@@ -328,13 +354,13 @@ impl Range {
     }
 
     /// The line of codes of some bits that covers it.
-    fn line(self, bits: u8, scale: &ChannelScale) -> StoredLine {
+    pub(super) fn line(self, bits: u8, scale: &ChannelScale) -> StoredLine {
         StoredLine::covering(self.min, self.max, (1 << bits) - 1, scale.unit)
     }
 }
 
 /// What nothing is predicted from.
-const NOTHING: Brick = [0.0; BRICK_VOXELS];
+pub(super) const NOTHING: Brick = [0.0; BRICK_VOXELS];
 
 /// The voxels of a row along z, and the rows of a brick.
 const ROW: usize = 8;
@@ -391,7 +417,7 @@ fn last_code(bits: u8) -> f32 {
 }
 
 /// The codes of a brick on the lines of its octants.
-fn quantize(
+pub(super) fn quantize(
     values: &Brick,
     predicted: &Brick,
     lines: &[Line; 8],
@@ -418,7 +444,7 @@ fn error(values: &Brick, given: &Brick, scale: &ChannelScale) -> Option<Error> {
 }
 
 /// The error of the values that the codes of a brick lead to. `None` if an empty voxel is not empty or a sign changed.
-fn quantized_error(
+pub(super) fn quantized_error(
     values: &Brick,
     predicted: &Brick,
     lines: &[Line; 8],
@@ -474,10 +500,10 @@ fn quantized_error_on(
 }
 
 /// A few points and what their interpolation predicts of a brick.
-struct Prediction<const POINTS: usize> {
+pub(super) struct Prediction<const POINTS: usize> {
     line: StoredLine,
     codes: [u8; POINTS],
-    predicted: Brick,
+    pub(super) predicted: Brick,
 }
 
 /// The least-squares fit of a line through eight values at 0 to 7: weights of the value at each end. With the positions
@@ -499,38 +525,47 @@ const EMPTY_ROUNDS: usize = 3;
 
 impl Prediction<8> {
     fn gradient(values: &Brick, scale: &ChannelScale) -> Self {
-        Prediction::fit(values, scale, fit_corners, interpolate_corners)
+        Prediction::above_floor(values, scale, fit_corners, interpolate_corners)
     }
 }
 
 impl Prediction<LATTICE_POINTS> {
     fn lattice(values: &Brick, scale: &ChannelScale) -> Self {
-        Prediction::fit(values, scale, fit_lattice, interpolate_lattice)
+        Prediction::above_floor(values, scale, fit_lattice, interpolate_lattice)
     }
 }
 
 impl<const POINTS: usize> Prediction<POINTS> {
     /// Fits points. What they predict below the floor is as good as the floor, so where voxels are empty they are
     /// fitted to what was predicted there before, as far as that is below.
-    fn fit(
+    fn above_floor(
         values: &Brick,
         scale: &ChannelScale,
         fit: impl Fn(&Brick) -> [f32; POINTS],
         interpolate: impl Fn(&[f32; POINTS], &mut Brick),
     ) -> Self {
-        let mut target = *values;
-        let has_empty = values.contains(&scale.floor);
-        let mut points = fit(&target);
-        if has_empty {
-            let mut predicted = [0.0; BRICK_VOXELS];
-            for _ in 0..EMPTY_ROUNDS {
-                interpolate(&points, &mut predicted);
-                for i in 0..BRICK_VOXELS {
-                    let is_below = values[i] == scale.floor && predicted[i] < scale.floor;
-                    target[i] = if is_below { predicted[i] } else { values[i] };
-                }
-                points = fit(&target);
+        let rounds = if values.contains(&scale.floor) { EMPTY_ROUNDS } else { 0 };
+        let is_free = |i: usize, predicted| values[i] == scale.floor && predicted < scale.floor;
+        Prediction::fit(values, scale, rounds, is_free, fit, interpolate)
+    }
+
+    /// Fits points, and so many times once more, with what they predicted in the place of free values.
+    pub(super) fn fit(
+        values: &Brick,
+        scale: &ChannelScale,
+        rounds: usize,
+        is_free: impl Fn(usize, f32) -> bool,
+        fit: impl Fn(&Brick) -> [f32; POINTS],
+        interpolate: impl Fn(&[f32; POINTS], &mut Brick),
+    ) -> Self {
+        let mut points = fit(values);
+        let (mut target, mut predicted) = (*values, [0.0; BRICK_VOXELS]);
+        for _ in 0..rounds {
+            interpolate(&points, &mut predicted);
+            for i in 0..BRICK_VOXELS {
+                target[i] = if is_free(i, predicted[i]) { predicted[i] } else { values[i] };
             }
+            points = fit(&target);
         }
         // Bounds of entries end at twice the unit.
         let points = points.map(|point| point.clamp(-1.9 * scale.unit, 1.9 * scale.unit));
@@ -558,9 +593,14 @@ impl<const POINTS: usize> Prediction<POINTS> {
         quantized_error(values, &self.predicted, &[line; 8], bits, scale)
     }
 
-    fn write(&self, values: &Brick, bits: u8, scale: &ChannelScale, words: &mut Vec<u32>) {
+    /// Appends the words of the points.
+    pub(super) fn write_points(&self, words: &mut Vec<u32>) {
         words.push(self.line.word);
         words.extend(self.codes.as_chunks::<4>().0.iter().map(|codes| u32::from_le_bytes(*codes)));
+    }
+
+    fn write(&self, values: &Brick, bits: u8, scale: &ChannelScale, words: &mut Vec<u32>) {
+        self.write_points(words);
         if bits > 0 {
             let line = Range::of_residuals(values, &self.predicted, scale).line(bits, scale);
             words.push(line.word);
@@ -570,7 +610,7 @@ impl<const POINTS: usize> Prediction<POINTS> {
 }
 
 /// The corners whose trilinear interpolation is closest to the values.
-fn fit_corners(values: &Brick) -> [f32; 8] {
+pub(super) fn fit_corners(values: &Brick) -> [f32; 8] {
     // One axis after the other: rows of eight become pairs.
     let mut along_z = [[0.0; 2]; 64];
     for (pair, row) in along_z.iter_mut().zip(values.as_chunks::<8>().0) {
@@ -687,10 +727,11 @@ mod tests {
             let scale = scale(if is_distance { 1.0 } else { 0.0 });
             let blocks = [BlockFormat::Bc3, BlockFormat::Bc4, BlockFormat::Bc7];
             let blocks = blocks.map(|format| Codec::Block { format, axis: PackingAxis::Y });
-            let codecs = [&CODECS[..], &blocks].concat();
-            prop_assert!(CODECS.is_sorted_by_key(|codec| codec.word_count()));
             let shapes = Shapes::default();
             let mut measure = Measure::of(&values, &scale, &shapes);
+            let codecs: Vec<Codec> = measure.codecs().collect();
+            prop_assert!(codecs.is_sorted_by_key(|codec| codec.word_count()));
+            let codecs = [&codecs[..], &blocks].concat();
             prop_assert!(measure.error(Codec::F32) == Some(Error::default()));
             for codec in codecs {
                 let Some(error) = measure.error(codec) else { continue };

@@ -17,7 +17,7 @@ use super::level::{Level, Tile};
 use super::plan::{ChannelPlan, ChannelTree, Plan, channel_trees};
 use crate::each;
 use crate::encode::choose::{Candidate, Curve, Lambda, Target, Totals};
-use crate::encode::quantize::{Brick, CODECS, ChannelScale, Error, Measure, constant, write};
+use crate::encode::quantize::{Brick, ChannelScale, Error, Measure, constant, write};
 use crate::encode::shapes::{SAMPLE_BRICKS, Shapes};
 use crate::import::linear_transform;
 
@@ -176,9 +176,8 @@ fn source_header(grid: &Grid, metadata: &Metadata) -> Result<Vec<u8>, EncodeErro
 
 /// What decides which codec a brick gets.
 struct Choice {
-    codecs: Vec<Codec>,
-    /// Whether it is the first of these that can hold the brick, whatever it costs.
-    is_forced: bool,
+    /// The one that was asked for: it is not weighed against others, and what it cannot hold takes more.
+    asked: Option<Codec>,
     max_error: Option<f32>,
     lambda: Lambda,
     shapes: Arc<Shapes>,
@@ -188,36 +187,23 @@ impl Choice {
     fn new(planned: &ChannelPlan, options: &Options, lambda: Lambda) -> Choice {
         let options = options.for_channel(&planned.key.grid);
         let shapes = Arc::clone(&planned.shapes);
-        match options.codec {
-            // A codec that is asked for is not weighed against others; what it cannot hold takes more.
-            Some(codec) => {
-                let codecs = vec![codec, Codec::Uniform { bits: 8 }, Codec::F32];
-                Choice { codecs, is_forced: true, max_error: None, lambda, shapes }
-            }
-            None => Choice {
-                codecs: CODECS.to_vec(),
-                is_forced: false,
-                max_error: options.max_error.map(|bound| bound.of(planned.peak())),
-                lambda,
-                shapes,
-            },
-        }
+        let max_error = options.max_error.map(|bound| bound.of(planned.peak()));
+        Choice { asked: options.codec, max_error, lambda, shapes }
     }
 
     /// The codecs that are the best for a brick with some λ up to that of the choice.
     fn curve(&self, brick: &Brick, scale: &ChannelScale) -> Curve {
-        Curve::of(&mut Measure::of(brick, scale, &self.shapes), &self.codecs, self.max_error, self.lambda)
+        Curve::of(&mut Measure::of(brick, scale, &self.shapes), self.max_error, self.lambda)
     }
 
     fn best(&self, brick: &Brick, scale: &ChannelScale) -> Candidate {
-        if !self.is_forced {
+        let Some(asked) = self.asked else {
             return self.curve(brick, scale).at(self.lambda);
-        }
+        };
         let mut measure = Measure::of(brick, scale, &self.shapes);
-        let mut held = self
-            .codecs
-            .iter()
-            .filter_map(|codec| Some(Candidate { codec: *codec, error: measure.error(*codec)? }));
+        let mut held = [asked, Codec::Uniform { bits: 8 }]
+            .into_iter()
+            .filter_map(|codec| Some(Candidate { codec, error: measure.error(codec)? }));
         held.next().unwrap_or(Candidate { codec: Codec::F32, error: Error::default() })
     }
 }
@@ -313,7 +299,7 @@ pub fn weigh_frame(
         };
         let largest = planned.before.map_or(largest, |before| largest.max(before.lambda));
         let choice = Choice::new(planned, options, largest);
-        if choice.is_forced {
+        if choice.asked.is_some() {
             return Ok(WeighedChannel { channel: index, totals: Totals::default(), curves: Vec::new() });
         }
         let level = Level::of(&tree.tree, IVec3::ZERO);
@@ -337,7 +323,7 @@ fn encode_level(
     let coded = each(level.bricks.len(), |i| {
         let brick = &level.bricks[i];
         let best = match curves {
-            Some(curves) if !choice.is_forced => curves[i].at(choice.lambda),
+            Some(curves) if choice.asked.is_none() => curves[i].at(choice.lambda),
             _ => choice.best(brick, scale),
         };
         let mut words = Vec::with_capacity(best.codec.word_count());

@@ -1,7 +1,7 @@
 //! How the values of a brick are stored: the codecs and their decoders.
 //!
 //! An encoded brick is a [`Codec`] and some words in the store that all bricks of a volume share. This module decodes;
-//! [`codes`] reads codes of few bits, [`bounds`] the bounds of an entry. Encoders, and the choice among codecs, live in
+//! [`codes`] reads codes of few bits, [`sparse`] those of bricks that are partly empty, [`bounds`] the bounds of an entry. Encoders, and the choice among codecs, live in
 //! the pipeline. What a tree is, and where bricks stand in it, is [`crate::packed`]'s.
 //!
 //! A channel has a *unit*, a power of two no smaller than any of its values, and a *floor*, the smallest value it can
@@ -11,6 +11,7 @@
 pub mod block;
 pub mod bounds;
 pub mod codes;
+pub mod sparse;
 
 use block::{BlockFormat, PackingAxis};
 
@@ -53,6 +54,15 @@ pub enum Codec {
         /// The bits of a code.
         bits: u8,
     },
+    /// Codes of 1 to 7 bits of those voxels that are there: a word as in [`Codec::Uniform`], one with the bits of a code,
+    /// if it is fitted the three words of corners of [`Codec::Gradient`], from whose interpolation the codes
+    /// lead on; then the words of [`sparse`], and 0 in what is left of `2 × pairs` words. Voxels that are not there are 0.
+    Sparse {
+        /// Whether corners predict the values.
+        is_fitted: bool,
+        /// Half the words of the brick.
+        pairs: u8,
+    },
     /// The values of a shape, scaled: a word with bias and scale, both half floats in units (the shape's own values count
     /// as they are); the shape's offset in the shape store; the tag of its codec. A shape is stored as a brick is, and
     /// is not shared itself.
@@ -69,6 +79,11 @@ pub enum Codec {
 
 const FORMATS: [BlockFormat; 3] = [BlockFormat::Bc4, BlockFormat::Bc3, BlockFormat::Bc7];
 const AXES: [PackingAxis; 3] = [PackingAxis::X, PackingAxis::Y, PackingAxis::Z];
+
+/// The first tags of [`Codec::Sparse`], and the first beyond.
+const SPARSE_TAG: u8 = 56;
+const SPARSE_FITTED_TAG: u8 = SPARSE_TAG + 70;
+const SPARSE_END_TAG: u8 = SPARSE_FITTED_TAG + 70;
 
 impl Codec {
     /// The codec's number in a file.
@@ -95,6 +110,8 @@ impl Codec {
                 first + axis
             }
             Codec::Split { bits } => 43 + bits,
+            Codec::Sparse { is_fitted: false, pairs } => SPARSE_TAG + pairs,
+            Codec::Sparse { is_fitted: true, pairs } => SPARSE_FITTED_TAG + pairs,
         }
     }
 
@@ -113,6 +130,12 @@ impl Codec {
                 Some(Codec::Block { format: FORMATS[format], axis: *AXES.get(axis)? })
             }
             44..=51 => Some(Codec::Split { bits: tag - 43 }),
+            SPARSE_TAG..SPARSE_END_TAG => {
+                let is_fitted = tag >= SPARSE_FITTED_TAG;
+                let pairs = tag - if is_fitted { SPARSE_FITTED_TAG } else { SPARSE_TAG };
+                // With less there is no room for masks.
+                (pairs > 2).then_some(Codec::Sparse { is_fitted, pairs })
+            }
             _ => None,
         }
     }
@@ -129,6 +152,7 @@ impl Codec {
             Codec::Lattice { bits: 0 } => 1 + LATTICE_POINTS / 4,
             Codec::Lattice { bits } => 2 + LATTICE_POINTS / 4 + codes::word_count(bits),
             Codec::Split { bits } => 5 + codes::word_count(bits),
+            Codec::Sparse { pairs, .. } => 2 * usize::from(pairs),
             Codec::Shared => 3,
             Codec::Block { format, .. } => 1 + format.brick_bytes() / 4,
         }
@@ -147,6 +171,9 @@ pub enum DecodeError {
     /// Its shape is no brick, or a shared one itself.
     #[error("a shared brick without a shape")]
     NoShape,
+    /// Its words say that there are more.
+    #[error("a sparse brick whose voxels are not all there")]
+    Sparse,
     /// It holds a half float that is infinite or no number.
     #[error("a brick with a number that is none")]
     NotFinite,
@@ -213,6 +240,12 @@ pub fn interpolate_corners(corners: &[f32; 8], out: &mut [f32; BRICK_VOXELS]) {
             }
         }
     }
+}
+
+/// The interpolation of corners in two words of 8-bit codes.
+fn decode_corners(line: Line, words: [u32; 2], out: &mut [f32; BRICK_VOXELS]) {
+    let code = |i: usize| words[i / 4] >> (i % 4 * 8) & 0xff;
+    interpolate_corners(&std::array::from_fn(|i| line.at(code(i))), out);
 }
 
 /// The points of the lattice of [`Codec::Lattice`].
@@ -307,8 +340,7 @@ impl BrickContext<'_> {
             }
             (Codec::Gradient { bits }, [line, low, high, rest @ ..]) => {
                 let line = Line::from_word(*line, self.unit)?;
-                let code = |i: usize| [low, high][i / 4] >> (i % 4 * 8) & 0xff;
-                interpolate_corners(&std::array::from_fn(|i| line.at(code(i))), out);
+                decode_corners(line, [*low, *high], out);
                 if let [line, words @ ..] = rest {
                     let line = Line::from_word(*line, self.unit)?;
                     codes::unpack(bits, words, out, |predicted, code| predicted + line.at(code));
@@ -330,6 +362,28 @@ impl BrickContext<'_> {
                 // Each voxel is given its octant first, which then becomes its value.
                 out.iter_mut().enumerate().for_each(|(i, value)| *value = octant_of(i) as f32);
                 codes::unpack(bits, words, out, |octant, code| octants[octant as usize & 7].at(code));
+            }
+            (Codec::Sparse { is_fitted, .. }, [line, bits, rest @ ..]) => {
+                let line = Line::from_word(*line, self.unit)?;
+                let rest = match (is_fitted, rest) {
+                    (true, [corners, low, high, rest @ ..]) => {
+                        decode_corners(Line::from_word(*corners, self.unit)?, [*low, *high], out);
+                        rest
+                    }
+                    (true, _) => return Err(DecodeError::Sparse),
+                    (false, rest) => {
+                        out.fill(0.0);
+                        rest
+                    }
+                };
+                let bits = u8::try_from(*bits).map_err(|_| DecodeError::Sparse)?;
+                let symbols = sparse::unpack(bits, rest).ok_or(DecodeError::Sparse)?;
+                for (value, symbol) in out.iter_mut().zip(symbols) {
+                    *value = match symbol {
+                        0 => 0.0,
+                        symbol => *value + line.at(u32::from(symbol) - 1),
+                    };
+                }
             }
             (Codec::Block { format, axis }, [line, words @ ..]) => {
                 let line = Line::from_word(*line, self.unit)?;
@@ -363,7 +417,7 @@ mod tests {
     #[test]
     fn tags_and_codecs_are_inverse() {
         let all: Vec<Codec> = (0..=255).filter_map(Codec::from_tag).collect();
-        assert_eq!(all.len(), 44);
+        assert_eq!(all.len(), 44 + 2 * 67);
         for (i, codec) in all.iter().enumerate() {
             assert_eq!(Codec::from_tag(codec.tag()), Some(*codec));
             assert!(!all[..i].contains(codec));
@@ -399,6 +453,34 @@ mod tests {
         let context = BrickContext { words: &shared, shapes: &words[2..37], unit: 4.0, floor: 0.0 };
         context.decode(Codec::Shared, 0, &mut out).unwrap();
         assert_eq!(out, [4.0 + 2.0 * 7.0; BRICK_VOXELS]);
+    }
+
+    #[test]
+    fn sparse_voxels_lead_on_from_corners_and_others_are_empty() {
+        let symbols = std::array::from_fn(|i| if i % 3 == 0 { (i % 4 + 1) as u8 } else { 0 });
+        // Corners 1 everywhere and codes in steps of 0.5, in units of 2.
+        let (fitted, plain) = ([0x3800 << 16, 2, HALF_ONE, 0, 0], [0x3800 << 16, 2]);
+        for (is_fitted, head, predicted) in [(true, &fitted[..], 2.0), (false, &plain[..], 0.0)] {
+            let mut words = head.to_vec();
+            sparse::pack(2, &symbols, &mut words);
+            words.resize(words.len().next_multiple_of(2), 0);
+            let codec = Codec::Sparse { is_fitted, pairs: (words.len() / 2) as u8 };
+            let decode = |words: &[u32], codec, out: &mut _| {
+                let context = BrickContext { words, shapes: &[], unit: 2.0, floor: 0.0 };
+                context.decode(codec, 0, out)
+            };
+            let mut out = [9.0; BRICK_VOXELS];
+            decode(&words, codec, &mut out).unwrap();
+            for (value, symbol) in out.iter().zip(symbols) {
+                let expected = if symbol > 0 { predicted + f32::from(symbol - 1) } else { 0.0 };
+                assert_eq!(*value, expected);
+            }
+            words[1] = 8;
+            assert_eq!(decode(&words, codec, &mut out), Err(DecodeError::Sparse));
+            let short = Codec::Sparse { is_fitted, pairs: 3 };
+            words[1] = 2;
+            assert_eq!(decode(&words, short, &mut out), Err(DecodeError::Sparse));
+        }
     }
 
     #[test]

@@ -8,11 +8,25 @@
 
 use super::entropy;
 use super::predict::{Number, Predictor, residuals, restore};
-use crate::codec::{Codec, codes};
+use crate::codec::{Codec, codes, sparse};
 use crate::space::BRICK_VOXELS;
 
-/// One more than the largest tag of a codec.
-const TAGS: usize = 52;
+/// The groups of bricks whose values stand together: one for each tag but those of sparse bricks, then one for each number of bits of
+/// these, first of those that are not fitted.
+const GROUPS: usize = FIRST_SPARSE + 2 * sparse::MAX_BITS as usize;
+const FIRST_SPARSE: usize = 52;
+
+/// The group of a brick, by the word of a sparse one that says the bits of its codes.
+fn group(codec: Codec, sparse_bits: u32) -> usize {
+    match codec {
+        Codec::Sparse { is_fitted, .. } => {
+            // Any other number is in no file that decodes; such words stand as they are in the last group.
+            let bits = sparse_bits.wrapping_sub(1).min(u32::from(sparse::MAX_BITS) - 1) as usize;
+            FIRST_SPARSE + bits + if is_fitted { usize::from(sparse::MAX_BITS) } else { 0 }
+        }
+        codec => usize::from(codec.tag()),
+    }
+}
 
 /// The number of [`Mode::Coded`].
 const CODED: u8 = 1 + Predictor::ALL.len() as u8;
@@ -53,7 +67,8 @@ const SHAPE_OFFSETS: usize = 2;
 const SHAPE_TAGS: usize = 3;
 const OCTANTS: usize = 4;
 const LATTICES: usize = 5;
-const HEAD_STREAMS: usize = 6;
+const SPARSE_BITS: usize = 6;
+const HEAD_STREAMS: usize = 7;
 
 /// The streams of a lattice with codes.
 const LATTICE: [usize; 18] = {
@@ -72,6 +87,8 @@ fn head(codec: Codec) -> &'static [usize] {
         Codec::Lattice { bits: 0 } => LATTICE.split_last().map_or(&[], |(_, head)| head),
         Codec::Lattice { .. } => &LATTICE,
         Codec::Split { .. } => &[LINES, OCTANTS, OCTANTS, OCTANTS, OCTANTS],
+        Codec::Sparse { is_fitted: false, .. } => &[LINES, SPARSE_BITS],
+        Codec::Sparse { is_fitted: true, .. } => &[LINES, SPARSE_BITS, LINES, CORNERS, CORNERS],
         Codec::Shared => &[LINES, SHAPE_OFFSETS, SHAPE_TAGS],
     }
 }
@@ -81,15 +98,21 @@ fn head(codec: Codec) -> &'static [usize] {
 enum Values {
     None,
     Codes(u8),
-    /// So many words of texture blocks, which have no neighbours that predict them.
-    Blocks(usize),
+    /// Masks and codes of the voxels that are there, of so many bits.
+    Sparse(u8),
+    /// Texture blocks, which have no neighbours that predict them.
+    Blocks,
     Halves,
     Floats,
 }
 
 impl Values {
-    fn of(codec: Codec) -> Values {
-        match codec {
+    /// What a group of bricks holds. `None` if no codec has its number.
+    fn of_group(group: usize) -> Option<Values> {
+        if let Some(sparse) = group.checked_sub(FIRST_SPARSE) {
+            return Some(Values::Sparse((sparse % usize::from(sparse::MAX_BITS)) as u8 + 1));
+        }
+        Some(match Codec::from_tag(group as u8)? {
             Codec::Constant | Codec::Shared | Codec::Gradient { bits: 0 } | Codec::Lattice { bits: 0 } => {
                 Values::None
             }
@@ -97,82 +120,73 @@ impl Values {
             | Codec::Gradient { bits }
             | Codec::Lattice { bits }
             | Codec::Split { bits } => Values::Codes(bits),
-            Codec::Block { .. } => Values::Blocks(codec.word_count() - 1),
+            Codec::Sparse { .. } => return None,
+            Codec::Block { .. } => Values::Blocks,
             Codec::F16 => Values::Halves,
             Codec::F32 => Values::Floats,
-        }
+        })
     }
 
     fn plane_count(self) -> usize {
         match self {
-            Values::None | Values::Codes(_) | Values::Blocks(_) => 1,
+            Values::None | Values::Codes(_) | Values::Sparse(_) | Values::Blocks => 1,
             Values::Halves => 2,
             Values::Floats => 4,
         }
     }
 
-    /// Takes the bytes of so many bricks' values. `None` if they are not there.
-    fn take<'a>(self, mode: Mode, bricks: usize, rest: &mut &'a [u8]) -> Option<&'a [u8]> {
+    /// Takes the bytes of the values of some bricks, which are so many words in all. `None` if they are not there.
+    fn take<'a>(self, mode: Mode, bricks: usize, words: usize, rest: &mut &'a [u8]) -> Option<&'a [u8]> {
         let len = match (self, mode) {
             (_, Mode::Coded) if bricks == 0 => 0,
             (_, Mode::Coded) => u32::from_le_bytes(*rest.split_off(..4)?.first_chunk()?) as usize,
-            _ => bricks * self.brick_bytes(mode),
+            (Values::Codes(_), Mode::Predicted(_)) => bricks * BRICK_VOXELS,
+            _ => 4 * words,
         };
         rest.split_off(..len)
-    }
-
-    /// The bytes of a brick's values in a stream.
-    fn brick_bytes(self, mode: Mode) -> usize {
-        match (self, mode) {
-            (Values::None, _) => 0,
-            (Values::Codes(_), Mode::Predicted(_)) => BRICK_VOXELS,
-            (Values::Codes(bits), Mode::Words | Mode::Coded) => 4 * codes::word_count(bits),
-            (Values::Blocks(words), _) => 4 * words,
-            (Values::Halves, _) => 2 * BRICK_VOXELS,
-            (Values::Floats, _) => 4 * BRICK_VOXELS,
-        }
     }
 }
 
 /// The most bytes that the words of such bricks become.
 pub(super) fn max_encoded_bytes(codecs: &[Codec]) -> u64 {
     let bytes = |codec: &Codec| (4 * codec.word_count() + BRICK_VOXELS) as u64;
-    // A mode for each tag, and at most a length.
-    codecs.iter().map(bytes).sum::<u64>() + 5 * TAGS as u64
+    // A mode for each group, and at most a length.
+    codecs.iter().map(bytes).sum::<u64>() + 5 * GROUPS as u64
 }
 
 /// The bytes of the words of some bricks, one after the other.
 pub(super) fn encode(codecs: &[Codec], words: &[u32]) -> Vec<u8> {
     let mut heads = [const { Vec::new() }; HEAD_STREAMS];
-    let mut values = [const { Vec::new() }; TAGS];
+    let mut values = [const { Vec::new() }; GROUPS];
     let mut rest = words;
     for codec in codecs {
         let (brick, after) = rest.split_at(codec.word_count());
         let (first, last) = brick.split_at(head(*codec).len());
         first.iter().zip(head(*codec)).for_each(|(word, stream)| heads[*stream].push(*word));
-        values[usize::from(codec.tag())].extend_from_slice(last);
+        values[group(*codec, first.get(1).copied().unwrap_or_default())].push(last);
         rest = after;
     }
-    let mut out = vec![0; TAGS];
+    let mut out = vec![0; GROUPS];
     heads.iter().for_each(|words| out.extend(word_planes(words)));
-    for (tag, words) in values.iter().enumerate() {
-        let Some(codec) = Codec::from_tag(tag as u8).filter(|_| !words.is_empty()) else { continue };
-        let values = Values::of(codec);
+    for (group, bricks) in values.iter().enumerate() {
+        let Some(values) = Values::of_group(group).filter(|_| !bricks.is_empty()) else { continue };
         // Measured on clouds: a byte for a code of one or two bits never pays, however well it is predicted. What is
         // not entropy-coded here is so by whoever compresses the page.
         let modes = match values {
             Values::Codes(..=2) => vec![Mode::Coded, Mode::Words],
             Values::Codes(_) => [&[Mode::Coded][..], &Predictor::ALL.map(Mode::Predicted)].concat(),
-            Values::Blocks(_) => vec![Mode::Words],
+            Values::Blocks => vec![Mode::Words],
+            Values::Sparse(_) => vec![Mode::Coded, Mode::Words],
             _ => Predictor::ALL.map(Mode::Predicted).to_vec(),
         };
-        let candidates = modes.into_iter().map(|mode| (mode, encode_values(values, mode, words)));
+        let candidates =
+            modes.into_iter().filter_map(|mode| Some((mode, encode_values(values, mode, bricks)?)));
         let best = candidates.min_by_key(|(mode, bytes)| match mode {
             Mode::Coded => 8 * bytes.len() as u64,
             _ => entropy_bits(bytes, values.plane_count()),
         });
         if let Some((mode, bytes)) = best {
-            out[tag] = mode.number();
+            out[group] = mode.number();
             out.extend(bytes);
         }
     }
@@ -181,70 +195,99 @@ pub(super) fn encode(codecs: &[Codec], words: &[u32]) -> Vec<u8> {
 
 /// The words of bricks of these codecs from what [`encode`] made of them. `None` if it made no such bytes.
 pub(super) fn decode(codecs: &[Codec], bytes: &[u8]) -> Option<Vec<u32>> {
-    let (modes, mut rest) = bytes.split_at_checked(TAGS)?;
-    let (mut head_counts, mut brick_counts) = ([0; HEAD_STREAMS], [0; TAGS]);
+    let (modes, mut rest) = bytes.split_at_checked(GROUPS)?;
+    let mut head_counts = [0; HEAD_STREAMS];
     for codec in codecs {
         head(*codec).iter().for_each(|stream| head_counts[*stream] += 1);
-        brick_counts[usize::from(codec.tag())] += 1;
     }
     let mut heads = [const { Planes::<4>::NONE }; HEAD_STREAMS];
     for (head, count) in heads.iter_mut().zip(head_counts) {
         *head = Planes::new(rest.split_off(..4 * count)?);
     }
-    let mut streams = [const { None }; TAGS];
-    for (tag, stream) in streams.iter_mut().enumerate() {
-        let Some(codec) = Codec::from_tag(tag as u8) else { continue };
-        let (mode, values) = (Mode::from_number(modes[tag])?, Values::of(codec));
-        let bytes = values.take(mode, brick_counts[tag], &mut rest)?;
-        *stream = Some(Stream::new(values, mode, brick_counts[tag], bytes)?);
+    // What says the group of a sparse brick stands among the first words.
+    let mut sparse_bits = heads[SPARSE_BITS].clone();
+    let (mut groups, mut counts) = (Vec::with_capacity(codecs.len()), [(0, 0); GROUPS]);
+    for codec in codecs {
+        let bits = if let Codec::Sparse { .. } = codec { u32::from_le_bytes(sparse_bits.next()?) } else { 0 };
+        let group = group(*codec, bits);
+        let (bricks, words) = &mut counts[group];
+        *bricks += 1;
+        *words += codec.word_count().checked_sub(head(*codec).len())?;
+        groups.push(group);
+    }
+    let mut streams = [const { None }; GROUPS];
+    for (group, stream) in streams.iter_mut().enumerate() {
+        let Some(values) = Values::of_group(group) else { continue };
+        let (mode, (bricks, words)) = (Mode::from_number(modes[group])?, counts[group]);
+        let bytes = values.take(mode, bricks, words, &mut rest)?;
+        *stream = Some(Stream::new(values, mode, bricks, bytes)?);
     }
     if !rest.is_empty() {
         return None;
     }
     let mut words = Vec::with_capacity(codecs.iter().map(|codec| codec.word_count()).sum());
-    for codec in codecs {
+    for (codec, group) in codecs.iter().zip(groups) {
         for stream in head(*codec) {
             words.push(u32::from_le_bytes(heads[*stream].next()?));
         }
-        streams[usize::from(codec.tag())].as_mut()?.next_brick(&mut words)?;
+        let values = codec.word_count() - head(*codec).len();
+        streams[group].as_mut()?.next_brick(values, &mut words)?;
     }
     Some(words)
 }
 
-/// The values of all bricks of a codec in one mode.
-fn encode_values(values: Values, mode: Mode, words: &[u32]) -> Vec<u8> {
-    match (values, mode) {
+/// The values of all bricks of a group in one mode. `None` if they cannot stand in it.
+fn encode_values(values: Values, mode: Mode, bricks: &[&[u32]]) -> Option<Vec<u8>> {
+    let codes_of =
+        |bits: u8| bricks.iter().map(move |brick| std::array::from_fn(|i| codes::code(bits, brick, i) as u8));
+    let coded = |bits, codes: &[[u8; BRICK_VOXELS]]| {
+        let coded = entropy::encode(bits, codes);
+        [&(coded.len() as u32).to_le_bytes()[..], &coded].concat()
+    };
+    Some(match (values, mode) {
         (Values::None, _) => Vec::new(),
-        (Values::Codes(_), Mode::Words) | (Values::Blocks(_), _) => {
-            words.iter().flat_map(|word| word.to_le_bytes()).collect()
+        (Values::Codes(_) | Values::Sparse(_), Mode::Words) | (Values::Blocks, _) => {
+            bricks.iter().flat_map(|brick| *brick).flat_map(|word| word.to_le_bytes()).collect()
         }
-        (Values::Codes(bits), Mode::Coded) => {
-            let bricks = words.chunks(codes::word_count(bits));
-            let codes: Vec<[u8; BRICK_VOXELS]> =
-                bricks.map(|brick| std::array::from_fn(|i| codes::code(bits, brick, i) as u8)).collect();
-            let coded = entropy::encode(bits, &codes);
-            [&(coded.len() as u32).to_le_bytes()[..], &coded].concat()
+        (Values::Codes(bits), Mode::Coded) => coded(bits, &codes_of(bits).collect::<Vec<_>>()),
+        (Values::Sparse(bits), Mode::Coded) => {
+            // Words that are not as they would be packed do not come back from symbols.
+            let symbols = |brick: &&[u32]| {
+                let symbols = sparse::unpack(bits, brick)?;
+                let mut packed = Vec::with_capacity(brick.len());
+                pack_sparse(bits, &symbols, brick.len(), &mut packed)?;
+                (packed == *brick).then_some(symbols)
+            };
+            coded(bits + 1, &bricks.iter().map(symbols).collect::<Option<Vec<_>>>()?)
         }
         (Values::Codes(bits), Mode::Predicted(predictor)) => {
-            let mut bytes = Vec::with_capacity(words.len() / usize::from(bits) * 32);
-            for brick in words.chunks(codes::word_count(bits)) {
-                let mut codes = std::array::from_fn(|i| codes::code(bits, brick, i) as u8);
+            let mut bytes = Vec::with_capacity(bricks.len() * BRICK_VOXELS);
+            for mut codes in codes_of(bits) {
                 residuals(predictor, &mut codes, mask(bits));
                 bytes.extend(codes);
             }
             bytes
         }
+        (Values::Sparse(_), Mode::Predicted(_)) => return None,
         (Values::Halves, _) => {
-            let halves: Vec<u16> =
-                words.iter().flat_map(|word| [*word as u16, (*word >> 16) as u16]).collect();
+            let words = bricks.iter().flat_map(|brick| *brick);
+            let halves: Vec<u16> = words.flat_map(|word| [*word as u16, (*word >> 16) as u16]).collect();
             let bricks = predicted(&halves, mode, ordered_half);
             split_planes::<2>(bricks.iter().map(|half| half.to_le_bytes()))
         }
         (Values::Floats, _) => {
-            let bricks = predicted(words, mode, ordered_float);
+            let bricks = predicted(&bricks.concat(), mode, ordered_float);
             split_planes::<4>(bricks.iter().map(|word| word.to_le_bytes()))
         }
-    }
+    })
+}
+
+/// Appends the words of a sparse brick, and zeros up to `len` of them. `None` if these are too few.
+fn pack_sparse(bits: u8, symbols: &sparse::Symbols, len: usize, words: &mut Vec<u32>) -> Option<()> {
+    let begin = words.len();
+    sparse::pack(bits, symbols, words);
+    let end = begin + len;
+    (words.len() <= end).then(|| words.resize(end, 0))
 }
 
 /// The residuals of floats, bricks one after the other, that are numbers in their order after `ordered`.
@@ -262,9 +305,10 @@ fn predicted<T: Number>(floats: &[T], mode: Mode, ordered: impl Fn(T) -> T) -> V
 /// The values of all bricks of a codec, one brick after the other.
 enum Stream<'a> {
     None,
-    Packed { brick_bytes: usize, bytes: &'a [u8] },
+    Packed { bytes: &'a [u8] },
     Codes { bits: u8, predictor: Predictor, bytes: &'a [u8] },
     Coded { bits: u8, decoder: Box<entropy::Decoder<'a>> },
+    Sparse { bits: u8, decoder: Box<entropy::Decoder<'a>> },
     Halves { mode: Mode, planes: Planes<'a, 2> },
     Floats { mode: Mode, planes: Planes<'a, 4> },
 }
@@ -277,12 +321,14 @@ impl<'a> Stream<'a> {
             (Values::Codes(bits), Mode::Coded) => {
                 Stream::Coded { bits, decoder: Box::new(entropy::Decoder::new(bits, bricks, bytes)?) }
             }
-            (_, Mode::Coded) => return None,
-            (Values::None, _) => Stream::None,
-            (Values::Codes(bits), Mode::Words) => {
-                Stream::Packed { brick_bytes: 4 * codes::word_count(bits), bytes }
+            (Values::Sparse(bits), Mode::Coded) => {
+                Stream::Sparse { bits, decoder: Box::new(entropy::Decoder::new(bits + 1, bricks, bytes)?) }
             }
-            (Values::Blocks(words), _) => Stream::Packed { brick_bytes: 4 * words, bytes },
+            (_, Mode::Coded) | (Values::Sparse(_), Mode::Predicted(_)) => return None,
+            (Values::None, _) => Stream::None,
+            (Values::Codes(_) | Values::Sparse(_), Mode::Words) | (Values::Blocks, _) => {
+                Stream::Packed { bytes }
+            }
             (Values::Codes(bits), Mode::Predicted(predictor)) => Stream::Codes { bits, predictor, bytes },
             (Values::Halves, mode) => Stream::Halves { mode, planes: Planes::new(bytes) },
             (Values::Floats, mode) => Stream::Floats { mode, planes: Planes::new(bytes) },
@@ -290,15 +336,22 @@ impl<'a> Stream<'a> {
         Some(stream)
     }
 
-    /// Appends the words of the next brick. `None` if there is none.
-    fn next_brick(&mut self, words: &mut Vec<u32>) -> Option<()> {
+    /// Appends the values of the next brick, which are `len` words. `None` if there is none.
+    fn next_brick(&mut self, len: usize, words: &mut Vec<u32>) -> Option<()> {
         match self {
             Stream::None => {}
-            Stream::Packed { brick_bytes, bytes } => {
-                let brick = bytes.split_off(..*brick_bytes)?;
+            Stream::Packed { bytes } => {
+                let brick = bytes.split_off(..4 * len)?;
                 words.extend(brick.as_chunks().0.iter().map(|word| u32::from_le_bytes(*word)));
             }
             Stream::Coded { bits, decoder } => codes::pack(*bits, &decoder.next_brick()?, words),
+            Stream::Sparse { bits, decoder } => {
+                let symbols = decoder.next_brick()?;
+                if symbols.iter().any(|symbol| *symbol > 1 << *bits) {
+                    return None;
+                }
+                pack_sparse(*bits, &symbols, len, words)?;
+            }
             Stream::Codes { bits, predictor, bytes } => {
                 let mut numbers: [u8; BRICK_VOXELS] = *bytes.split_off(..BRICK_VOXELS)?.first_chunk()?;
                 restore(*predictor, &mut numbers, mask(*bits));
@@ -349,6 +402,7 @@ fn float_of_ordered(number: u32) -> u32 {
 }
 
 /// Numbers of `N` bytes in byte planes, read one after the other.
+#[derive(Clone)]
 struct Planes<'a, const N: usize> {
     planes: [&'a [u8]; N],
     at: usize,
@@ -438,12 +492,29 @@ pub(super) mod tests {
             if *codec == Codec::Shared {
                 words[first as usize + 1..].copy_from_slice(&[shape, 16]);
             }
+            if let Codec::Sparse { .. } = codec
+                && !is_noise
+            {
+                let begin = first as usize + head(*codec).len();
+                let bits = (i % usize::from(sparse::MAX_BITS)) as u8 + 1;
+                words[first as usize + 1] = u32::from(bits);
+                // As many voxels as there is room for, at most.
+                let voxels = 8 * (words.len() - begin);
+                let symbols = std::array::from_fn(|voxel| match voxel < voxels.saturating_sub(64) {
+                    true => mixed(seed ^ voxel as u32) as u8 % (1 << bits) + 1,
+                    false => 0,
+                });
+                let mut packed = Vec::new();
+                if pack_sparse(bits, &symbols, words.len() - begin, &mut packed).is_some() {
+                    words[begin..].copy_from_slice(&packed);
+                }
+            }
         }
         words
     }
 
     pub(in crate::format) fn any_codecs(len: usize) -> impl Strategy<Value = Vec<Codec>> {
-        let codec = (1_u8..52).prop_filter_map("a codec", Codec::from_tag);
+        let codec = (1_u8..200).prop_filter_map("a codec", Codec::from_tag);
         proptest::collection::vec(codec, 0..len)
     }
 
@@ -461,28 +532,44 @@ pub(super) mod tests {
         #[test]
         fn values_come_back_in_every_mode(tag in prop::sample::select(vec![1_u8, 2, 3, 4, 5, 6, 7, 8, 9, 10, 19]), seed in any::<u32>()) {
             let codec = Codec::from_tag(tag).unwrap();
-            let values = Values::of(codec);
-            let count = 3 * values.brick_bytes(Mode::Words) / 4;
-            let words: Vec<u32> = (0..count as u32).map(|i| mixed(i ^ seed)).collect();
+            let values = Values::of_group(usize::from(tag)).unwrap();
+            let count = codec.word_count() - head(codec).len();
+            let words: Vec<u32> = (0..3 * count as u32).map(|i| mixed(i ^ seed)).collect();
+            let bricks: Vec<&[u32]> = words.chunks(count).collect();
             let modes = Predictor::ALL.map(Mode::Predicted).into_iter().chain([Mode::Words, Mode::Coded]);
             for mode in modes.filter(|mode| *mode != Mode::Coded || matches!(values, Values::Codes(_))) {
                 prop_assert_eq!(Mode::from_number(mode.number()), Some(mode));
-                let bytes = encode_values(values, mode, &words);
+                let bytes = encode_values(values, mode, &bricks).unwrap();
                 let mut rest = &bytes[..];
-                let taken = values.take(mode, 3, &mut rest).unwrap();
+                let taken = values.take(mode, 3, words.len(), &mut rest).unwrap();
                 prop_assert!(rest.is_empty());
-                prop_assert!(mode == Mode::Coded || taken.len() == 3 * values.brick_bytes(mode));
                 let mut stream = Stream::new(values, mode, 3, taken).unwrap();
                 let mut found = Vec::new();
-                (0..3).for_each(|_| stream.next_brick(&mut found).unwrap());
+                (0..3).for_each(|_| stream.next_brick(count, &mut found).unwrap());
                 prop_assert_eq!(&found, &words);
             }
         }
 
         #[test]
+        fn sparse_bricks_are_smaller_than_their_words(seed in any::<u32>()) {
+            let symbols: sparse::Symbols = std::array::from_fn(|i| {
+                let (height, noise) = (i as u32 >> 6, mixed(seed ^ i as u32) & 1);
+                if height + noise < 5 { (height + noise) as u8 + 1 } else { 0 }
+            });
+            let mut words = vec![0, 3];
+            sparse::pack(3, &symbols, &mut words);
+            words.resize(words.len().next_multiple_of(2), 0);
+            let codecs = [Codec::Sparse { is_fitted: false, pairs: (words.len() / 2) as u8 }; 40];
+            let words = words.repeat(40);
+            let bytes = encode(&codecs, &words);
+            prop_assert!(bytes.len() < 3 * words.len(), "{}", bytes.len());
+            prop_assert_eq!(decode(&codecs, &bytes), Some(words));
+        }
+
+        #[test]
         fn any_bytes_are_words_or_none(codecs in any_codecs(4), bytes in proptest::collection::vec(any::<u8>(), 0..3000), mode in 0_u8..9) {
             let mut bytes = bytes;
-            bytes.iter_mut().take(TAGS).for_each(|byte| *byte = mode);
+            bytes.iter_mut().take(GROUPS).for_each(|byte| *byte = mode);
             if let Some(words) = decode(&codecs, &bytes) {
                 prop_assert_eq!(words.len(), codecs.iter().map(|codec| codec.word_count()).sum::<usize>());
             }
