@@ -1,7 +1,7 @@
 //! Choosing a codec for each brick: as few words as keep to the quality asked for.
 //!
 //! An error bound holds for each brick alone. A signal-to-noise ratio holds for a channel over all frames, and bricks pay
-//! for it where it is cheapest: each takes the codec for which words plus λ times squared error are least, and λ is
+//! for it where it is cheapest: each takes the codec for which words plus λ times its weighed error are least, and λ is
 //! the smallest with which all bricks together meet the ratio. So λ has to be settled before the first brick is written:
 //! [`Totals`] adds up what each λ of a fixed ladder would lead to. One λ for all frames also means that the bricks which
 //! they have in common get the same words.
@@ -72,15 +72,22 @@ pub struct Candidate {
     pub codec: Codec,
     /// How far off the brick is in it.
     pub error: Error,
+    /// What that counts beside words: squares and bias, times the weight of the brick.
+    pub weighed: f64,
 }
 
 impl Candidate {
+    /// A codec for a brick whose errors count `weight` times.
+    pub fn new(codec: Codec, error: Error, weight: f64) -> Candidate {
+        Candidate { codec, error, weighed: weight * (error.squared + error.bias) }
+    }
+
     fn words(&self) -> f64 {
         self.codec.word_count() as f64
     }
 
     fn cost(&self, lambda: Lambda) -> f64 {
-        self.words() + lambda.0 * self.error.squared
+        self.words() + lambda.0 * self.weighed
     }
 }
 
@@ -90,8 +97,8 @@ impl Candidate {
 pub struct Curve(Vec<Candidate>);
 
 impl Curve {
-    /// Tries codecs as far as they can be the best with some λ up to `largest`.
-    pub fn of(measure: &mut Measure, max_error: Option<f32>, largest: Lambda) -> Curve {
+    /// Tries codecs as far as they can be the best with some λ up to `largest`, for a brick whose errors count `weight` times.
+    pub fn of(measure: &mut Measure, weight: f64, largest: Lambda) -> Curve {
         let mut curve: Vec<Candidate> = Vec::new();
         for codec in measure.codecs() {
             // With a smaller λ, the best so far but gains on what takes more words.
@@ -100,11 +107,11 @@ impl Curve {
                 break;
             }
             let Some(error) = measure.error(codec) else { continue };
-            if max_error.is_some_and(|bound| error.max > bound) {
+            if error.max > measure.scale().max_error {
                 continue;
             }
-            let candidate = Candidate { codec, error };
-            if curve.last().is_some_and(|last| last.error.squared <= error.squared) {
+            let candidate = Candidate::new(codec, error, weight);
+            if curve.last().is_some_and(|last| last.weighed <= candidate.weighed) {
                 continue;
             }
             // Drop what is never the best beside this one.
@@ -142,7 +149,7 @@ impl Curve {
 
 /// The λ beyond which `fine` is better than `coarse`.
 fn turn(coarse: &Candidate, fine: &Candidate) -> f64 {
-    (fine.words() - coarse.words()) / (coarse.error.squared - fine.error.squared)
+    (fine.words() - coarse.words()) / (coarse.weighed - fine.weighed)
 }
 
 /// What each λ leads to: the sum of squared errors, in units of the channel, and of words over some bricks.
@@ -240,35 +247,41 @@ mod tests {
         background: 0.0,
         background_tolerance: 1e-3,
         keeps_sign: false,
+        max_error: f32::INFINITY,
     };
+
+    fn bounded(max_error: Option<f32>) -> ChannelScale {
+        ChannelScale { max_error: max_error.unwrap_or(f32::INFINITY), ..SCALE }
+    }
 
     fn bricks() -> Vec<Brick> {
         let wave =
             |i: usize, brick: usize| ((i * i * (brick + 3)) as f32 * 0.001).sin() * 0.4 / (1 + brick) as f32;
-        let empty = |i: usize, brick: usize| brick % 4 == 0 && i % (brick + 8) < brick;
+        let empty = |i: usize, brick: usize| brick.is_multiple_of(4) && i % (brick + 8) < brick;
         let value = |i, brick| if empty(i, brick) { 0.0 } else { 0.5 + wave(i, brick) };
         (0..40).map(|brick| std::array::from_fn(|i| value(i, brick))).collect()
     }
 
     fn curve(brick: &Brick, max_error: Option<f32>, largest: Lambda) -> Curve {
-        Curve::of(&mut Measure::of(brick, &SCALE, &Shapes::default()), max_error, largest)
+        Curve::of(&mut Measure::of(brick, &bounded(max_error), &Shapes::default()), 1.0, largest)
     }
 
     /// The least that a brick costs, tried codec by codec.
     fn least(brick: &Brick, max_error: Option<f32>, lambda: Lambda) -> f64 {
         let shapes = Shapes::default();
-        let mut measure = Measure::of(brick, &SCALE, &shapes);
+        let scale = bounded(max_error);
+        let mut measure = Measure::of(brick, &scale, &shapes);
         let candidates = measure.codecs().filter_map(|codec| {
             let error =
                 measure.error(codec).filter(|error| max_error.is_none_or(|bound| error.max <= bound))?;
-            Some(Candidate { codec, error }.cost(lambda))
+            Some(Candidate::new(codec, error, 1.0).cost(lambda))
         });
         candidates.fold(f64::INFINITY, f64::min)
     }
 
     fn spent(bricks: &[Brick], max_error: Option<f32>, lambda: Lambda) -> (f64, f32, u64) {
         bricks.iter().fold((0.0, 0.0, 0), |(squared, max, words), brick| {
-            let Candidate { codec, error } = curve(brick, max_error, lambda).at(lambda);
+            let Candidate { codec, error, .. } = curve(brick, max_error, lambda).at(lambda);
             (squared + error.squared, error.max.max(max), words + codec.word_count() as u64)
         })
     }

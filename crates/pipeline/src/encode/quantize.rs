@@ -36,6 +36,8 @@ pub struct ChannelScale {
     pub background_tolerance: f32,
     /// Whether no value may change its sign.
     pub keeps_sign: bool,
+    /// No voxel should be further off; infinite if that is not asked for. The encoder gives nothing up that is more.
+    pub max_error: f32,
 }
 
 /// How far a coded brick is from its source.
@@ -45,6 +47,8 @@ pub struct Error {
     pub squared: f64,
     /// The largest of a voxel, in the channel's numbers.
     pub max: f32,
+    /// What counts besides `squared` where codecs are weighed, for errors that are all of one sign: a ray adds these up.
+    pub bias: f64,
 }
 
 /// The codecs that are tried on every brick, the cheapest first.
@@ -104,6 +108,11 @@ impl<'a> Measure<'a> {
         Measure { values, scale, shapes, range, gradient: None, lattice: None, sparse }
     }
 
+    /// How the brick is written.
+    pub fn scale(&self) -> &ChannelScale {
+        self.scale
+    }
+
     /// The codecs to be tried unless one is asked for, the cheapest first. The last can hold any brick.
     pub fn codecs(&self) -> impl Iterator<Item = Codec> + use<> {
         let sparse = self.sparse.as_ref().map_or(Vec::new(), Sparse::codecs);
@@ -136,7 +145,7 @@ impl<'a> Measure<'a> {
                     lattice.get_or_insert_with(|| Prediction::lattice(values, scale).ranged(values, scale));
                 lattice.error(*residuals, values, bits, scale)
             }
-            Codec::Sparse { is_fitted, pairs } => sparse.as_ref()?.error(is_fitted, pairs, scale),
+            Codec::Sparse { is_fitted, pairs } => sparse.as_ref()?.error(values, is_fitted, pairs, scale),
             Codec::Split { bits } => {
                 quantized_error(values, &NOTHING, &Split::over(values, scale, bits).lines, bits, scale)
             }
@@ -496,7 +505,7 @@ fn quantized_error_on(
     let has_fog = largest(fog) * unit > scale.background_tolerance;
     let is_flipped = scale.keeps_sign && flips.contains(&1);
     let squared = squared.iter().map(|squared| f64::from(*squared)).sum();
-    (!has_fog && !is_flipped).then(|| Error { squared, max: largest(max) * unit })
+    (!has_fog && !is_flipped).then(|| Error { squared, max: largest(max) * unit, bias: 0.0 })
 }
 
 /// A few points and what their interpolation predicts of a brick.
@@ -701,6 +710,7 @@ mod tests {
             background,
             background_tolerance: 1e-3,
             keeps_sign: background != 0.0,
+            max_error: f32::INFINITY,
         }
     }
 

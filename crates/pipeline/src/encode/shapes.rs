@@ -72,6 +72,7 @@ impl Shapes {
             background: f32::MIN,
             background_tolerance: 0.0,
             keeps_sign: false,
+            max_error: f32::INFINITY,
         };
         let encode = |shape: &Brick| {
             let mut words = Vec::new();

@@ -1,6 +1,10 @@
 //! Bricks that are partly empty, in [`Codec::Sparse`]: only the voxels that are there have codes.
 //!
-//! Codes are found and measured as those of whole bricks are, with empty voxels filled in such a way that they are exact.
+//! With codes of few bits, voxels that are next to nothing are left out as well: what is empty is
+//! then one more code, and the faint fringe of smoke costs next to nothing.
+//!
+//! Codes are found and measured as those of whole bricks are, with voxels that are left out filled in such a way that
+//! they are exact; what they lose is added.
 
 use nuage_volume::codec::{Codec, interpolate_corners, sparse};
 use nuage_volume::space::BRICK_VOXELS;
@@ -9,22 +13,30 @@ use super::quantize::{
     Brick, ChannelScale, Error, NOTHING, Prediction, Range, fit_corners, quantize, quantized_error,
 };
 
-/// A brick of which some voxels are there and others are not, with and without corners that predict it.
+const MAX_BITS: usize = sparse::MAX_BITS as usize;
+
+/// A brick of which some voxels are empty and others are not.
 pub(super) struct Sparse {
-    plain: Way,
-    fitted: Option<Way>,
-    /// The words of masks and codes by the bits of codes, less 1.
-    words: [usize; sparse::MAX_BITS as usize],
+    /// Corners fitted to the voxels that are not empty.
+    corners: Option<Prediction<8>>,
+    /// By the bits of a code, less 1.
+    by_bits: [Kept; MAX_BITS],
 }
 
-/// What codes lead on from.
-struct Way {
-    prediction: Option<Prediction<8>>,
-    /// What the values of the voxels that are there differ from it.
-    range: Range,
-    /// The values, with those of empty voxels as code 0 gives them.
-    filled: Brick,
+/// The voxels that are kept with codes of some bits.
+#[derive(Clone, Copy)]
+struct Kept {
+    /// Those are whose magnitude is more than this.
+    above: f32,
+    /// The words of masks and codes.
+    words: usize,
+    /// What leaving out the others costs.
+    lost: Error,
 }
+
+/// How much more than its square the error of voxels that are left out counts. Measured on explosions: without it, pictures of the
+/// same size are a quarter further off, although the ratio of signal to noise is better by a decibel.
+const LOST_BIAS: f64 = 15.0;
 
 /// How often corners are fitted anew, with what they predicted in the place of empty voxels.
 const ROUNDS: usize = 6;
@@ -39,39 +51,56 @@ impl Sparse {
         if scale.background != 0.0 || voxels == 0 || voxels == BRICK_VOXELS {
             return None;
         }
-        let words = std::array::from_fn(|i| sparse::word_count(i as u8 + 1, |voxel| values[voxel] != 0.0));
-        let plain = Way::new(values, None, scale);
-        let fitted = (voxels >= FITTED_VOXELS).then(|| {
+        let corners = (voxels >= FITTED_VOXELS).then(|| {
             let sum: f64 = values.iter().map(|value| f64::from(*value)).sum();
             let mean = (sum / voxels as f64) as f32;
             let is_free = |voxel: usize, _| values[voxel] == 0.0;
             let begin = values.map(|value| if value == 0.0 { mean } else { value });
-            let fitted = Prediction::fit(&begin, scale, ROUNDS, is_free, fit_corners, interpolate_corners);
-            Way::new(values, Some(fitted), scale)
+            Prediction::fit(&begin, scale, ROUNDS, is_free, fit_corners, interpolate_corners)
         });
-        Some(Sparse { plain, fitted, words })
+        let (min, max) = values.iter().fold((0.0_f32, 0.0_f32), |(min, max), v| (min.min(*v), max.max(*v)));
+        let by_bits = std::array::from_fn(|i| {
+            // A quarter of the step of codes of which one is 0.
+            let quarter_step = (0.25 * max - 0.25 * min) / (2 << i) as f32;
+            Kept::above(quarter_step.min(scale.max_error), i as u8 + 1, values, scale)
+        });
+        Some(Sparse { corners, by_bits })
     }
 
     /// The codecs that can be worth trying, the cheapest first.
     pub(super) fn codecs(&self) -> Vec<Codec> {
-        let mut codecs = Vec::new();
-        let fitted = self.fitted.iter().map(|way| (true, way));
-        for (is_fitted, way) in std::iter::once((false, &self.plain)).chain(fitted) {
-            codecs.extend(self.words.map(|words| {
-                let pairs = (words + way.head_words()).div_ceil(2) as u8;
+        let ways = if self.corners.is_some() { &[false, true][..] } else { &[false] };
+        let codec = |is_fitted: bool| {
+            move |kept: &Kept| {
+                let pairs = (head_words(is_fitted) + kept.words).div_ceil(2) as u8;
                 Codec::Sparse { is_fitted, pairs }
-            }));
-        }
+            }
+        };
+        let mut codecs: Vec<Codec> =
+            ways.iter().flat_map(|is_fitted| self.by_bits.iter().map(codec(*is_fitted))).collect();
         codecs.sort_by_key(|codec| codec.word_count());
         codecs.dedup();
         codecs
     }
 
     /// The error in a codec of so many words. `None` if they are too few.
-    pub(super) fn error(&self, is_fitted: bool, pairs: u8, scale: &ChannelScale) -> Option<Error> {
-        let (way, bits) = self.way(is_fitted, pairs)?;
-        let line = way.range.line(bits, scale).line;
-        quantized_error(&way.filled, way.predicted(), &[line; 8], bits, scale)
+    pub(super) fn error(
+        &self,
+        values: &Brick,
+        is_fitted: bool,
+        pairs: u8,
+        scale: &ChannelScale,
+    ) -> Option<Error> {
+        let (predicted, bits) = self.way(is_fitted, pairs)?;
+        let kept = &self.by_bits[usize::from(bits) - 1];
+        let (filled, range) = kept.fill(values, predicted, scale);
+        let line = range.line(bits, scale).line;
+        let error = quantized_error(&filled, predicted, &[line; 8], bits, scale)?;
+        Some(Error {
+            squared: error.squared + kept.lost.squared,
+            max: error.max.max(kept.lost.max),
+            bias: kept.lost.bias,
+        })
     }
 
     /// Appends the words of a codec that has an error.
@@ -83,49 +112,63 @@ impl Sparse {
         scale: &ChannelScale,
         words: &mut Vec<u32>,
     ) {
-        let Some((way, bits)) = self.way(is_fitted, pairs) else { return };
+        let Some((predicted, bits)) = self.way(is_fitted, pairs) else { return };
         let end = words.len() + 2 * usize::from(pairs);
-        let line = way.range.line(bits, scale);
+        let kept = &self.by_bits[usize::from(bits) - 1];
+        let (filled, range) = kept.fill(values, predicted, scale);
+        let line = range.line(bits, scale);
         words.extend([line.word, u32::from(bits)]);
-        if let Some(prediction) = &way.prediction {
-            prediction.write_points(words);
+        if let Some(corners) = self.corners.as_ref().filter(|_| is_fitted) {
+            corners.write_points(words);
         }
-        let codes = quantize(&way.filled, way.predicted(), &[line.line; 8], bits, scale);
-        let symbol = |i: usize| if values[i] == 0.0 { 0 } else { codes[i] + 1 };
+        let codes = quantize(&filled, predicted, &[line.line; 8], bits, scale);
+        let symbol = |i: usize| if kept.holds(values[i]) { codes[i] + 1 } else { 0 };
         sparse::pack(bits, &std::array::from_fn(symbol), words);
         words.resize(end, 0);
     }
 
-    /// The way of a codec and the bits of its codes: the most for which there is room.
-    fn way(&self, is_fitted: bool, pairs: u8) -> Option<(&Way, u8)> {
-        let way = if is_fitted { self.fitted.as_ref()? } else { &self.plain };
-        let room = (2 * usize::from(pairs)).checked_sub(way.head_words())?;
-        let bits = self.words.iter().rposition(|words| *words <= room)? + 1;
-        Some((way, bits as u8))
+    /// What predicts the values in a codec, and the bits of its codes: the most for which there is room.
+    fn way(&self, is_fitted: bool, pairs: u8) -> Option<(&Brick, u8)> {
+        let predicted = if is_fitted { &self.corners.as_ref()?.predicted } else { &NOTHING };
+        let room = (2 * usize::from(pairs)).checked_sub(head_words(is_fitted))?;
+        let bits = self.by_bits.iter().rposition(|kept| kept.words <= room)? + 1;
+        Some((predicted, bits as u8))
     }
 }
 
-impl Way {
-    fn new(values: &Brick, prediction: Option<Prediction<8>>, scale: &ChannelScale) -> Way {
-        let predicted = prediction.as_ref().map_or(&NOTHING, |prediction| &prediction.predicted);
-        let there = values.iter().zip(predicted).filter(|(value, _)| **value != 0.0);
-        let range = Range::of(there.map(|(value, predicted)| value - predicted));
+impl Kept {
+    fn above(above: f32, bits: u8, values: &Brick, scale: &ChannelScale) -> Kept {
+        let empty = Kept { above, words: 0, lost: Error::default() };
+        let words = sparse::word_count(bits, |voxel| empty.holds(values[voxel]));
+        let mut lost = Error::default();
+        for value in values.iter().filter(|value| !empty.holds(**value)) {
+            lost.squared += f64::from(value / scale.unit).powi(2);
+            lost.max = lost.max.max(value.abs());
+        }
+        lost.bias = LOST_BIAS * lost.squared;
+        Kept { above, words, lost }
+    }
+
+    fn holds(&self, value: f32) -> bool {
+        value.abs() > self.above
+    }
+
+    /// The values, with those that are left out as code 0 gives them, and the range of what is kept.
+    fn fill(&self, values: &Brick, predicted: &Brick, scale: &ChannelScale) -> (Brick, Range) {
+        let kept = values.iter().zip(predicted).filter(|(value, _)| self.holds(**value));
+        let range = Range::of(kept.map(|(value, predicted)| value - predicted));
         let low = range.line(1, scale).line.low;
         let mut filled = *values;
-        for (filled, predicted) in filled.iter_mut().zip(predicted) {
-            if *filled == 0.0 {
-                *filled = (predicted + low).max(scale.floor);
+        for (value, predicted) in filled.iter_mut().zip(predicted) {
+            if !self.holds(*value) {
+                *value = (predicted + low).max(scale.floor);
             }
         }
-        Way { prediction, range, filled }
+        (filled, range)
     }
+}
 
-    fn predicted(&self) -> &Brick {
-        self.prediction.as_ref().map_or(&NOTHING, |prediction| &prediction.predicted)
-    }
-
-    /// The words before masks and codes.
-    fn head_words(&self) -> usize {
-        if self.prediction.is_some() { 5 } else { 2 }
-    }
+/// The words before masks and codes.
+fn head_words(is_fitted: bool) -> usize {
+    if is_fitted { 5 } else { 2 }
 }

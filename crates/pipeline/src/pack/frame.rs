@@ -9,11 +9,12 @@ use glam::IVec3;
 use nuage_vdb::{AnyTree, Grid, LEVEL5, Metadata, Tree, WriteOptions};
 use nuage_volume::build::TileSize;
 use nuage_volume::codec::Codec;
-use nuage_volume::format::Quality;
+use nuage_volume::format::{Quality, Role};
 
 pub use super::options::{Bound, Options};
 
 use super::level::{Level, Tile};
+use super::light;
 use super::plan::{ChannelPlan, ChannelTree, Plan, channel_trees};
 use crate::each;
 use crate::encode::choose::{Candidate, Curve, Lambda, Target, Totals};
@@ -109,17 +110,17 @@ fn encode_channel(
     let ChannelTree { key, tree, .. } = channel;
     let index = plan.find(&key).ok_or_else(|| EncodeError::NotPlanned(key.grid.clone()))?;
     let planned = &plan.channels[index];
-    let scale = planned.scale(tree.background);
-    let choice = Choice::new(planned, options, planned.lambda);
+    let choice = Choice::new(planned, options, tree.background, planned.lambda);
+    let scale = choice.scale;
     let offset = index_offset(&tree);
     let mut level = Level::of(&tree, offset >> 3);
     let (voxels, source_bricks) = (level.voxels(tree.background), level.bricks.len() as u64);
-    let (encoded, error) = encode_level(&level, &scale, &choice, curves);
+    let (encoded, error) = encode_level(&level, &choice, curves);
     let mut levels = vec![encoded];
     for _ in 0..options.coarser_levels {
         let Some(coarser) = level.coarser(tree.background) else { break };
         level = coarser;
-        levels.push(encode_level(&level, &scale, &choice, None).0);
+        levels.push(encode_level(&level, &choice, None).0);
     }
     let world_from_index =
         linear_transform(&grid.name, &grid.transform).ok().map(|affine| affine.to_cols_array());
@@ -178,33 +179,45 @@ fn source_header(grid: &Grid, metadata: &Metadata) -> Result<Vec<u8>, EncodeErro
 struct Choice {
     /// The one that was asked for: it is not weighed against others, and what it cannot hold takes more.
     asked: Option<Codec>,
-    max_error: Option<f32>,
+    /// How bricks are written.
+    scale: ChannelScale,
     lambda: Lambda,
     shapes: Arc<Shapes>,
+    /// Whether errors count by how much of a brick is seen.
+    is_lit: bool,
 }
 
 impl Choice {
-    fn new(planned: &ChannelPlan, options: &Options, lambda: Lambda) -> Choice {
+    fn new(planned: &ChannelPlan, options: &Options, background: f32, lambda: Lambda) -> Choice {
         let options = options.for_channel(&planned.key.grid);
         let shapes = Arc::clone(&planned.shapes);
-        let max_error = options.max_error.map(|bound| bound.of(planned.peak()));
-        Choice { asked: options.codec, max_error, lambda, shapes }
+        let max_error = options.max_error.map_or(f32::INFINITY, |bound| bound.of(planned.peak()));
+        let scale = ChannelScale { max_error, ..planned.scale(background) };
+        // A budget goes where it shows. A bound of the error is one for all voxels.
+        let is_lit =
+            options.bits_per_voxel.is_some() && options.psnr.is_none() && planned.role == Role::Density;
+        Choice { asked: options.codec, scale, lambda, shapes, is_lit }
+    }
+
+    /// How much the errors of each brick count.
+    fn weights(&self, level: &Level) -> Vec<f64> {
+        if self.is_lit { light::weights(level) } else { vec![1.0; level.bricks.len()] }
     }
 
     /// The codecs that are the best for a brick with some λ up to that of the choice.
-    fn curve(&self, brick: &Brick, scale: &ChannelScale) -> Curve {
-        Curve::of(&mut Measure::of(brick, scale, &self.shapes), self.max_error, self.lambda)
+    fn curve(&self, brick: &Brick, weight: f64) -> Curve {
+        Curve::of(&mut Measure::of(brick, &self.scale, &self.shapes), weight, self.lambda)
     }
 
-    fn best(&self, brick: &Brick, scale: &ChannelScale) -> Candidate {
+    fn best(&self, brick: &Brick, weight: f64) -> Candidate {
         let Some(asked) = self.asked else {
-            return self.curve(brick, scale).at(self.lambda);
+            return self.curve(brick, weight).at(self.lambda);
         };
-        let mut measure = Measure::of(brick, scale, &self.shapes);
+        let mut measure = Measure::of(brick, &self.scale, &self.shapes);
         let mut held = [asked, Codec::Uniform { bits: 8 }]
             .into_iter()
-            .filter_map(|codec| Some(Candidate { codec, error: measure.error(codec)? }));
-        held.next().unwrap_or(Candidate { codec: Codec::F32, error: Error::default() })
+            .filter_map(|codec| Some(Candidate::new(codec, measure.error(codec)?, weight)));
+        held.next().unwrap_or(Candidate::new(Codec::F32, Error::default(), weight))
     }
 }
 
@@ -292,18 +305,18 @@ pub fn weigh_frame(
     let weigh = |tree: ChannelTree| {
         let index = plan.find(&tree.key).ok_or_else(|| EncodeError::NotPlanned(tree.key.grid.clone()))?;
         let planned = &plan.channels[index];
-        let scale = planned.scale(tree.tree.background);
         let largest = match target(planned, options).squared_error {
             Some(squared) => Lambda::sure(planned.bricks, squared),
             None => Lambda::LARGEST,
         };
         let largest = planned.before.map_or(largest, |before| largest.max(before.lambda));
-        let choice = Choice::new(planned, options, largest);
+        let choice = Choice::new(planned, options, tree.tree.background, largest);
         if choice.asked.is_some() {
             return Ok(WeighedChannel { channel: index, totals: Totals::default(), curves: Vec::new() });
         }
         let level = Level::of(&tree.tree, IVec3::ZERO);
-        let curves = each(level.bricks.len(), |i| choice.curve(&level.bricks[i], &scale));
+        let weights = choice.weights(&level);
+        let curves = each(level.bricks.len(), |i| choice.curve(&level.bricks[i], weights[i]));
         // In the order of bricks, on which sums depend.
         let mut totals = Totals::default();
         curves.iter().for_each(|curve| totals.add(curve));
@@ -314,32 +327,29 @@ pub fn weigh_frame(
 
 /// Encodes the bricks of a level, by their curves if these are known. Gives the sum of their squared errors, in units
 /// of the channel, and the largest error as well.
-fn encode_level(
-    level: &Level,
-    scale: &ChannelScale,
-    choice: &Choice,
-    curves: Option<&[Curve]>,
-) -> (EncodedLevel, Error) {
+fn encode_level(level: &Level, choice: &Choice, curves: Option<&[Curve]>) -> (EncodedLevel, Error) {
+    let weights = if curves.is_none() { choice.weights(level) } else { Vec::new() };
     let coded = each(level.bricks.len(), |i| {
         let brick = &level.bricks[i];
         let best = match curves {
             Some(curves) if choice.asked.is_none() => curves[i].at(choice.lambda),
-            _ => choice.best(brick, scale),
+            _ => choice.best(brick, weights.get(i).copied().unwrap_or(1.0)),
         };
         let mut words = Vec::with_capacity(best.codec.word_count());
-        write(brick, best.codec, scale, &choice.shapes, &mut words);
+        write(brick, best.codec, &choice.scale, &choice.shapes, &mut words);
         (best, words)
     });
     let mut encoded = EncodedLevel { tiles: level.tiles.clone(), ..EncodedLevel::default() };
     let mut total = Error::default();
-    for ((place, brick), (Candidate { codec, error }, words)) in
+    for ((place, brick), (Candidate { codec, error, .. }, words)) in
         level.places.iter().zip(&level.bricks).zip(coded)
     {
-        total = Error { squared: total.squared + error.squared, max: total.max.max(error.max) };
+        total.squared += error.squared;
+        total.max = total.max.max(error.max);
         match codec {
             Codec::Constant => {
-                let value = constant(brick, scale);
-                if value != scale.background {
+                let value = constant(brick, &choice.scale);
+                if value != choice.scale.background {
                     encoded.tiles.push((*place, TileSize::Brick, value));
                 }
             }

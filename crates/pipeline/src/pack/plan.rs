@@ -105,6 +105,7 @@ impl ChannelPlan {
             background,
             background_tolerance: BACKGROUND_TOLERANCE * peak,
             keeps_sign: self.role == Role::SignedDistance,
+            max_error: f32::INFINITY,
         }
     }
 }

@@ -137,8 +137,11 @@ pub(super) fn frame_bytes(frame: &EncodedFrame) -> Vec<u8> {
     out.long(frame.grids.len() as u64);
     for grid in &frame.grids {
         out.long(grid.channel as u64);
-        let ChannelScale { unit, floor, background, background_tolerance, keeps_sign } = grid.scale;
-        [unit, floor, background, background_tolerance].into_iter().for_each(|number| out.float(number));
+        let ChannelScale { unit, floor, background, background_tolerance, keeps_sign, max_error } =
+            grid.scale;
+        [unit, floor, background, background_tolerance, max_error]
+            .into_iter()
+            .for_each(|number| out.float(number));
         out.0.push(u32::from(keeps_sign));
         out.place(grid.index_offset);
         out.0.push(u32::from(grid.active_box.is_some()));
@@ -224,6 +227,7 @@ fn grid(reader: &mut Reader, plan: &Plan) -> Option<EncodedGrid> {
         floor: reader.float()?,
         background: reader.float()?,
         background_tolerance: reader.float()?,
+        max_error: reader.float()?,
         keeps_sign: reader.flag()?,
     };
     let index_offset = reader.place()?;
@@ -418,6 +422,7 @@ mod tests {
                 floor: -0.0,
                 background: 1e-30,
                 background_tolerance: 0.1,
+                max_error: 0.2,
                 keeps_sign: channel == 1,
             },
             index_offset: [-128, 0, 128],

@@ -322,6 +322,7 @@ impl Encoder<'_> {
                     background: self.channel.floor,
                     background_tolerance: BACKGROUND_TOLERANCE * self.channel.peak,
                     keeps_sign: false,
+                    max_error: f32::INFINITY,
                 };
                 let mut words = Vec::with_capacity(wanted.word_count());
                 quantize::write(&decode()?, wanted, &scale, &Shapes::default(), &mut words);

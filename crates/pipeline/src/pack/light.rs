@@ -1,0 +1,210 @@
+//! How much of what a brick holds can be seen: where light hardly gets, errors hardly matter.
+//!
+//! A budget of words is best spent where it shows. Nothing is known here of cameras and lights, so what counts is the light that
+//! gets from a brick to the outside in 26 directions, through cells of a few voxels taken as homogeneous, in a medium so dense
+//! that a good part of it is hidden. An error shows in the light that is scattered there and comes out as it came in, so it weighs
+//! by the square.
+
+use glam::IVec3;
+use nuage_volume::build::TileSize;
+
+use super::level::Level;
+
+const BRICK_SIDE: usize = 8;
+
+/// The optical depth of the denser rays along an axis. `nuage render` takes the same where it is told nothing.
+const OPTICAL_DEPTH: f32 = 8.0;
+
+/// The part of rays that are less dense than these.
+const DENSER: f32 = 0.9;
+
+/// The sides of cells that are tried, in voxels.
+const CELL_SIDES: [usize; 3] = [2, 4, 8];
+
+/// The most cells of a box. In boxes that need more, all bricks count the same.
+const MAX_CELLS: i64 = 1 << 24;
+
+/// Weights are not less than a half to the power of this.
+const LEAST: f32 = 16.0;
+
+/// The mean densities of cells of 2³, 4³ or 8³ voxels in a box of bricks, z fastest.
+struct Cells {
+    size: [usize; 3],
+    /// The cells of a brick along an axis.
+    per_brick: usize,
+    means: Vec<f32>,
+    /// The first brick of the box.
+    first: IVec3,
+}
+
+/// The weight of errors in each brick of a density, a power of a half: frames that differ a little are to have the same
+/// weights.
+pub(super) fn weights(level: &Level) -> Vec<f64> {
+    let Some(cells) = Cells::of(level) else { return vec![1.0; level.bricks.len()] };
+    let extinction = OPTICAL_DEPTH / cells.denser_depth();
+    let mut transmittance = vec![0.0; cells.means.len()];
+    let directions = (0..27).map(|i| [i / 9 - 1, i / 3 % 3 - 1, i % 3 - 1]).filter(|d| *d != [0; 3]);
+    for direction in directions {
+        let depth = cells.depth(direction);
+        transmittance.iter_mut().zip(&depth).for_each(|(sum, depth)| *sum += (-extinction * depth).exp());
+    }
+    let weight = |place: &IVec3| {
+        let cells = cells.of_brick(*place);
+        let (sum, count) = cells.fold((0.0, 0.0), |(sum, count), cell| {
+            let mean: f32 = transmittance[cell] / 26.0;
+            (sum + mean * mean, count + 1.0)
+        });
+        let halvings = if sum > 0.0 { (-(sum / count).log2()).round().clamp(0.0, LEAST) } else { LEAST };
+        0.5_f64.powi(halvings as i32)
+    };
+    level.places.iter().map(weight).collect()
+}
+
+impl Cells {
+    /// The box around all bricks and tiles. `None` if it is too large or empty.
+    fn of(level: &Level) -> Option<Cells> {
+        let bricks = level.places.iter().map(|place| (*place, 1));
+        let all = || {
+            level.tiles.iter().map(|(place, size, _)| (*place, bricks_across(*size))).chain(bricks.clone())
+        };
+        let first = all().map(|(place, _)| place).reduce(IVec3::min)?;
+        let end = all().map(|(place, side)| place + side).reduce(IVec3::max)?;
+        let size = end.as_i64vec3() - first.as_i64vec3();
+        let bricks = size.x.checked_mul(size.y)?.checked_mul(size.z)?;
+        let per_brick = CELL_SIDES.map(|side| BRICK_SIDE / side).into_iter();
+        let per_brick = per_brick
+            .filter(|count| bricks.checked_mul(count.pow(3) as i64).is_some_and(|cells| cells <= MAX_CELLS))
+            .max()?;
+        let size = size.to_array().map(|side| side as usize * per_brick);
+        let mut cells = Cells { size, per_brick, means: vec![0.0; size.iter().product()], first };
+        for (place, size, value) in &level.tiles {
+            let [x, y, z] = cells.first_cell(*place);
+            let side = bricks_across(*size) as usize * per_brick;
+            for (i, j) in (0..side * side).map(|i| (i / side, i % side)) {
+                let begin = cells.index([x + i, y + j, z]);
+                cells.means[begin..begin + side].fill(value.max(0.0));
+            }
+        }
+        let cell_side = BRICK_SIDE / per_brick;
+        let part = 1.0 / (cell_side.pow(3)) as f32;
+        for (place, brick) in level.places.iter().zip(&level.bricks) {
+            let [x, y, z] = cells.first_cell(*place);
+            for (voxel, value) in brick.iter().enumerate() {
+                let [i, j, k] = [voxel >> 6, voxel >> 3 & 7, voxel & 7].map(|c| c / cell_side);
+                let cell = cells.index([x + i, y + j, z + k]);
+                // Parts of the largest float add up to one.
+                cells.means[cell] += part * value.max(0.0);
+            }
+        }
+        Some(cells)
+    }
+
+    /// The first cell of a brick.
+    fn first_cell(&self, place: IVec3) -> [usize; 3] {
+        (place - self.first).to_array().map(|c| c as usize * self.per_brick)
+    }
+
+    /// The cells of a brick.
+    fn of_brick(&self, place: IVec3) -> impl Iterator<Item = usize> {
+        let ([x, y, z], n) = (self.first_cell(place), self.per_brick);
+        (0..n * n * n).map(move |i| self.index([x + i / n / n, y + i / n % n, z + i % n]))
+    }
+
+    fn index(&self, [x, y, z]: [usize; 3]) -> usize {
+        (x * self.size[1] + y) * self.size[2] + z
+    }
+
+    /// The sum of means along the denser columns, of all axes together.
+    fn denser_depth(&self) -> f32 {
+        let mut sums = Vec::new();
+        for axis in 0..3 {
+            let [first, second] = [(axis + 1) % 3, (axis + 2) % 3];
+            for i in 0..self.size[first] * self.size[second] {
+                let mut at = [0; 3];
+                (at[first], at[second]) = (i / self.size[second], i % self.size[second]);
+                let column = (0..self.size[axis]).map(|c| {
+                    at[axis] = c;
+                    self.means[self.index(at)]
+                });
+                sums.push(column.sum::<f32>());
+            }
+        }
+        sums.retain(|sum| *sum > 0.0);
+        sums.sort_by(f32::total_cmp);
+        let denser = (sums.len() as f32 * DENSER) as usize;
+        sums.get(denser).or(sums.last()).copied().unwrap_or(1.0)
+    }
+
+    /// The sum of means from the middle of each cell to the outside, times the length of a step.
+    fn depth(&self, direction: [i32; 3]) -> Vec<f32> {
+        let step = (direction.iter().map(|d| d * d).sum::<i32>() as f32).sqrt();
+        let mut depth = vec![0.0; self.means.len()];
+        let order = |axis: usize, i: usize| if direction[axis] > 0 { self.size[axis] - 1 - i } else { i };
+        let [nx, ny, nz] = self.size;
+        for (i, j, k) in (0..nx * ny * nz).map(|i| (i / nz / ny, i / nz % ny, i % nz)) {
+            let at = [order(0, i), order(1, j), order(2, k)];
+            let next: [usize; 3] =
+                std::array::from_fn(|axis| at[axis].wrapping_add_signed(direction[axis] as isize));
+            let is_inside = (0..3).all(|axis| next[axis] < self.size[axis]);
+            let here = self.index(at);
+            let beyond = match is_inside {
+                true => depth[self.index(next)] + 0.5 * step * self.means[self.index(next)],
+                false => 0.0,
+            };
+            depth[here] = beyond + 0.5 * step * self.means[here];
+        }
+        depth
+    }
+}
+
+/// The bricks along a side of a tile.
+fn bricks_across(size: TileSize) -> i32 {
+    match size {
+        TileSize::Brick => 1,
+        TileSize::Node4 => 16,
+        TileSize::Node5 => 512,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A ball of bricks of a density, in the middle of which light comes from nowhere.
+    fn ball(radius: i32, density: f32) -> Level {
+        let mut level = Level::default();
+        for i in 0..(2 * radius + 1).pow(3) {
+            let side = 2 * radius + 1;
+            let place = IVec3::new(i / side / side, i / side % side, i % side) - radius;
+            if place.length_squared() <= radius * radius {
+                level.places.push(place);
+                level.bricks.push([density; 512]);
+            }
+        }
+        level
+    }
+
+    #[test]
+    fn what_lies_deeper_weighs_less_whatever_the_density() {
+        let level = ball(6, 1.0);
+        let weights = weights(&level);
+        let at = |place: IVec3| weights[level.places.iter().position(|p| *p == place).unwrap()];
+        let along: Vec<f64> = (0..=6).map(|x| at(IVec3::new(x, 0, 0))).collect();
+        assert!(along.is_sorted(), "{along:?}");
+        assert!(along[0] <= 1.0 / 256.0 && along[6] >= 0.25, "{along:?}");
+        assert_eq!(at(IVec3::new(0, 3, 0)), at(IVec3::new(0, 0, -3)));
+        for density in [1e-30, 1e30] {
+            assert_eq!(super::weights(&ball(6, density)), weights);
+        }
+    }
+
+    #[test]
+    fn tiles_cast_shadows_and_what_is_too_large_weighs_the_same() {
+        let mut level = ball(0, 1.0);
+        level.tiles.push((IVec3::splat(1), TileSize::Node4, 1.0));
+        assert_eq!(weights(&level).len(), 1);
+        level.tiles.push((IVec3::splat(1 << 20), TileSize::Brick, 1.0));
+        assert_eq!(weights(&level), [1.0]);
+        assert_eq!(weights(&Level::default()), [0.0; 0]);
+    }
+}
