@@ -1,7 +1,8 @@
-//! Less noise, by Open Image Denoise where it is installed: its own program `oidnDenoise` is run on PFM files.
+//! Less noise, by Open Image Denoise where it is installed: its own program `oidnDenoise` is run on PFM
+//! files.
 //!
-//! Nothing of it is linked: whoever has the program has the feature. What is given to it is decided by the caller: a
-//! picture in front of its background, or one with alpha.
+//! Nothing of it is linked: whoever has the program has the feature. What is given to it is decided by the
+//! caller: a picture in front of its background, or one with alpha.
 
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
@@ -33,8 +34,8 @@ fn find_in(path: &OsStr) -> Result<PathBuf, Failure> {
     })
 }
 
-/// The picture with less noise, guided by the albedo where paths first collide, one colour per pixel. Alpha is freed of noise
-/// by itself, if it differs from pixel to pixel.
+/// The picture with less noise, guided by the albedo where paths first collide, one colour per pixel. Alpha
+/// is freed of noise by itself, if it differs from pixel to pixel.
 ///
 /// # Errors
 /// If the program fails, with what it says.
@@ -79,8 +80,8 @@ fn run(
         .ok_or_else(|| failed("what it wrote is no PFM picture of the size given to it".into()))
 }
 
-/// Colours, row by row from the top, as a PFM file. Such files hold rows from the bottom; a negative scale says
-/// little-endian.
+/// Colours, row by row from the top, as a PFM file. Such files hold rows from the bottom; a negative scale
+/// says little-endian.
 fn encode_pfm([width, height]: [u32; 2], pixels: &[[f32; 3]]) -> Vec<u8> {
     let mut bytes = format!("PF\n{width} {height}\n-1.0\n").into_bytes();
     for row in pixels.chunks(width.max(1) as usize).rev() {

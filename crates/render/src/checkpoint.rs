@@ -1,12 +1,12 @@
 //! A film that is not finished, as bytes: what a render that goes on later starts from.
 //!
-//! All numbers are little-endian. The head: the eight bytes `nuagefil`, the version (u32), columns and rows (u32 each),
-//! the caller's digest of everything else that the film depends on (u128). Then the pixels, row by row from the top, each
-//! [`Tally`]'s numbers in the order of its fields: two u32, then 17 f64. At the end XXH3 (64 bits) of all bytes
-//! before it.
+//! All numbers are little-endian. The head: the eight bytes `nuagefil`, the version (u32), columns and rows
+//! (u32 each), the caller's digest of everything else that the film depends on (u128). Then the pixels, row
+//! by row from the top, each [`Tally`]'s numbers in the order of its fields: two u32, then 17 f64. At the end
+//! XXH3 (64 bits) of all bytes before it.
 //!
-//! What does not live here: files. What the digest is taken of is the caller's to say: the scene, the settings of the paths,
-//! the seed, and the version of the program, as other versions may trace other paths.
+//! What does not live here: files. What the digest is taken of is the caller's to say: the scene, the
+//! settings of the paths, the seed, and the version of the program, as other versions may trace other paths.
 
 use xxhash_rust::xxh3::{Xxh3, xxh3_64};
 

@@ -1,7 +1,7 @@
-//! Pictures in memory. A [`Film`] gathers what the paths of each pixel bring; an [`Image`] is what is looked at: scene-linear
-//! Rec.709 with premultiplied alpha, and what is done to whole pictures. Nothing here knows how a picture is rendered
-//! ([`progressive`](crate::progressive)), encoded ([`output`](crate::output)) or converted to a display's colours
-//! ([`color`](crate::color)).
+//! Pictures in memory. A [`Film`] gathers what the paths of each pixel bring; an [`Image`] is what is looked
+//! at: scene-linear Rec.709 with premultiplied alpha, and what is done to whole pictures. Nothing here knows
+//! how a picture is rendered ([`progressive`](crate::progressive)), encoded ([`output`](crate::output)) or
+//! converted to a display's colours ([`color`](crate::color)).
 
 use glam::Vec3;
 
@@ -94,7 +94,8 @@ impl Image {
 
 /// What the paths of one pixel brought: sums of what they saw, and how far their light lies from its mean.
 ///
-/// The sums of single in double precision are exact for all that matters: a mean of equal values is that value.
+/// The sums of single in double precision are exact for all that matters: a mean of equal values is that
+/// value.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Tally {
     /// Paths so far.
@@ -108,8 +109,8 @@ pub struct Tally {
     pub(crate) albedo: [f64; 3],
     /// The sum over the paths that met the medium.
     pub(crate) depth: f64,
-    /// Sums of squared distances from the mean, of red, green, blue and luminance, by Welford's method: sums of squares
-    /// would lose the small differences of bright pixels.
+    /// Sums of squared distances from the mean, of red, green, blue and luminance, by Welford's method: sums
+    /// of squares would lose the small differences of bright pixels.
     pub(crate) spread: [f64; 4],
 }
 
@@ -140,8 +141,8 @@ impl Tally {
         self.mean_light().map(|v| v as f32)
     }
 
-    /// The mean light that the medium gives off towards the camera. This, [`Tally::direct`] and [`Tally::indirect`] make
-    /// up [`Tally::light`].
+    /// The mean light that the medium gives off towards the camera. This, [`Tally::direct`] and
+    /// [`Tally::indirect`] make up [`Tally::light`].
     pub fn emission(&self) -> [f32; 3] {
         self.mean(self.emission)
     }
@@ -166,13 +167,14 @@ impl Tally {
         (f64::from(self.hits) / f64::from(self.samples.max(1))) as f32
     }
 
-    /// The mean distance from the camera at which paths first collide, in world lengths along the ray, over those that
-    /// do; infinite if none does.
+    /// The mean distance from the camera at which paths first collide, in world lengths along the ray, over
+    /// those that do; infinite if none does.
     pub fn depth(&self) -> f32 {
         if self.hits == 0 { f32::INFINITY } else { (self.depth / f64::from(self.hits)) as f32 }
     }
 
-    /// The standard errors of red, green, blue and alpha, as far as the paths tell; 0 where there is only one.
+    /// The standard errors of red, green, blue and alpha, as far as the paths tell; 0 where there is only
+    /// one.
     pub fn standard_error(&self) -> [f32; 4] {
         let [r, g, b, _] = self.spread;
         // A path meets the medium or not, so that the spread follows from the counts.
@@ -251,7 +253,8 @@ impl Film {
         self.tiling.rows(self.tiles.iter().map(|tile| tile.iter().map(&f)))
     }
 
-    /// The picture: the mean light of each pixel; alpha is 1 − transmittance. Nothing stands behind the medium.
+    /// The picture: the mean light of each pixel; alpha is 1 − transmittance. Nothing stands behind the
+    /// medium.
     pub fn image(&self) -> Image {
         let pixel = |tally: &Tally| {
             let [r, g, b] = tally.light();
@@ -266,10 +269,10 @@ impl Film {
         all.fold([u32::MAX, 0], |[fewest, most], samples| [fewest.min(samples), most.max(samples)])
     }
 
-    /// How noisy the picture is: over the pixels from which any light came, the root mean square of
-    /// `e / (l + m / 10)`, where `l` is the luminance of a pixel, `e` its standard error, and `m` the mean of `l` over these
-    /// pixels. The last term keeps pixels that are nearly black from deciding alone. Neither exposure nor empty parts of the
-    /// picture change the figure.
+    /// How noisy the picture is: over the pixels from which any light came, the root mean square of `e / (l +
+    /// m / 10)`, where `l` is the luminance of a pixel, `e` its standard error, and `m` the mean of `l` over
+    /// these pixels. The last term keeps pixels that are nearly black from deciding alone. Neither exposure
+    /// nor empty parts of the picture change the figure.
     ///
     /// Infinite if a pixel has less than two paths; 0 for a black picture.
     pub fn noise(&self) -> f64 {
@@ -332,9 +335,10 @@ impl Tiling {
     }
 }
 
-/// Pictures side by side on an even, opaque ground of linear `colour`: row by row from the top left, `gap` pixels
-/// between neighbours and none around them. All cells have the size of the largest picture, and a smaller one
-/// lies at the top left of its cell. Fewer pictures than `columns` (at least 1) make a narrower sheet.
+/// Pictures side by side on an even, opaque ground of linear `colour`: row by row from the top left, `gap`
+/// pixels between neighbours and none around them. All cells have the size of the largest picture, and a
+/// smaller one lies at the top left of its cell. Fewer pictures than `columns` (at least 1) make a narrower
+/// sheet.
 ///
 /// Fails without pictures, and when the sheet would be larger than [`MAX_PIXELS`].
 pub fn contact_sheet(
@@ -498,8 +502,8 @@ mod tests {
             );
         };
         let errors = tally.standard_error();
-        for c in 0..3 {
-            check(tally.light()[c], Some(errors[c]), &|s| {
+        for (c, error) in errors.into_iter().enumerate().take(3) {
+            check(tally.light()[c], Some(error), &|s| {
                 f64::from(s.emission[c]) + f64::from(s.direct[c]) + f64::from(s.indirect[c])
             });
             check(tally.emission()[c], None, &|s| s.emission[c].into());
@@ -529,7 +533,8 @@ mod tests {
     fn noise_is_relative_and_known() {
         let mut film = Film::new(20, 18).unwrap();
         assert_eq!(film.noise(), f64::INFINITY);
-        // Half of the picture stays black; the other half has a standard error of 10 % and a floor of as much.
+        // Half of the picture stays black; the other half has a standard error of 10 % and a floor of as
+        // much.
         let grey = |value| PathSample { direct: Vec3::splat(value), ..PathSample::default() };
         for (i, tally) in film.tiles.iter_mut().flatten().enumerate() {
             for value in [0.9, 1.1] {

@@ -14,7 +14,8 @@ use crate::path::PathSettings;
 use crate::progressive::{self, Plan, Watch};
 use crate::scene::Scene;
 
-/// Renders a scene by marching. The picture's alpha is 1 − transmittance; nothing stands behind the medium yet.
+/// Renders a scene by marching. The picture's alpha is 1 − transmittance; nothing stands behind the medium
+/// yet.
 ///
 /// `progress` is called with tiles done and tiles in all, from any thread.
 ///
@@ -67,8 +68,8 @@ pub struct Traced {
     pub standard_error: Vec<[f32; 4]>,
 }
 
-/// Renders a scene by tracing `paths` paths per pixel, all in one go ([`progressive`] has the choice). Nothing stands behind
-/// the medium yet. Pictures of different seeds are independent.
+/// Renders a scene by tracing `paths` paths per pixel, all in one go ([`progressive`] has the choice).
+/// Nothing stands behind the medium yet. Pictures of different seeds are independent.
 ///
 /// `progress` is called with tiles done and tiles in all, from any thread.
 ///

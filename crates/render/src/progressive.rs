@@ -1,13 +1,13 @@
-//! Pictures that grow: paths in passes over all pixels, until there are enough of them, the noise is low, time is up or
-//! somebody calls it off.
+//! Pictures that grow: paths in passes over all pixels, until there are enough of them, the noise is low,
+//! time is up or somebody calls it off.
 //!
-//! Path number i of a pixel depends on the pixel, i and the seed alone, and the tally of a pixel on its own paths in their
-//! order. So a film is the same, bit for bit, for any number of threads, passes of any size, and a render that was stopped
-//! and went on.
+//! Path number i of a pixel depends on the pixel, i and the seed alone, and the tally of a pixel on its own
+//! paths in their order. So a film is the same, bit for bit, for any number of threads, passes of any size,
+//! and a render that was stopped and went on.
 //!
-//! All pixels get the same number of paths. To give more to those that look noisy would bias the picture: a pixel whose
-//! first paths all miss a rare bright event looks quiet, gets no more of them and stays too dark. Where the whole picture
-//! stops by its noise, the same holds to a degree that drowns in it.
+//! All pixels get the same number of paths. To give more to those that look noisy would bias the picture: a
+//! pixel whose first paths all miss a rare bright event looks quiet, gets no more of them and stays too dark.
+//! Where the whole picture stops by its noise, the same holds to a degree that drowns in it.
 //!
 //! What does not live here: files of what was not finished ([`checkpoint`](crate::checkpoint)), and signals.
 
@@ -38,8 +38,8 @@ pub struct Plan {
     pub samples: u32,
     /// Stop when [`Film::noise`] is no more than this, but not before [`MIN_NOISE_SAMPLES`] paths per pixel.
     pub noise: Option<f64>,
-    /// Stop when this long has passed since the call. A pass that it cuts short leaves some pixels without their paths of
-    /// this pass; but every pixel gets its first.
+    /// Stop when this long has passed since the call. A pass that it cuts short leaves some pixels without
+    /// their paths of this pass; but every pixel gets its first.
     pub time: Option<Duration>,
 }
 
@@ -62,7 +62,8 @@ impl Default for Plan {
 pub struct Watch<'w> {
     /// Set it to true, from anywhere, and the render ends as soon as the tiles in work are done.
     pub cancel: Option<&'w AtomicBool>,
-    /// Called after each tile, from any thread, with the share of the work that is done, as far as can be foreseen.
+    /// Called after each tile, from any thread, with the share of the work that is done, as far as can be
+    /// foreseen.
     pub tile: Option<&'w (dyn Fn(f64) + Sync)>,
     /// Called after each pass, and after one that was cut short, with the film so far.
     pub pass: Option<&'w mut dyn FnMut(&Film)>,

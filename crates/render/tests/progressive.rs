@@ -1,4 +1,5 @@
-//! Pictures that grow: the same however they came about, with errors that are what they say, and stopped when asked.
+//! Pictures that grow: the same however they came about, with errors that are what they say, and stopped when
+//! asked.
 
 mod common;
 
@@ -112,7 +113,8 @@ fn standard_errors_are_what_they_say() {
             found += squares / f64::from(SEEDS - 1);
             said += errors.iter().map(|error| f64::from(error[i][c]).powi(2)).sum::<f64>() / f64::from(SEEDS);
         }
-        // 48 variances, each of 200 means: known to about 1.5 %, somewhat less for light with rare bright paths.
+        // 48 variances, each of 200 means: known to about 1.5 %, somewhat less for light with rare bright
+        // paths.
         assert!(found > 0.0 && (found / said - 1.0).abs() < 0.08, "channel {c}: {found} {said}");
     }
 }

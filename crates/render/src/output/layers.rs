@@ -3,15 +3,15 @@
 //! | channels | what |
 //! | --- | --- |
 //! | `R` `G` `B` `A` | the picture, as the caller passes it |
-//! | `emission.` `direct.` `indirect.` + `R` `G` `B` | what its light is made of: the three add up to it, before anything stands behind it |
+//! | `emission.` `direct.` `indirect.` + `R` `G` `B` | its light in three parts, before anything stands behind it |
 //! | `albedo.` + `R` `G` `B` | the albedo where paths first collide, premultiplied |
 //! | `transmittance.Y` | 1 − alpha of the film, whatever the picture's alpha |
-//! | `Z` | the mean distance of first collisions, in world lengths along the ray; infinite where there are none |
+//! | `Z` | mean distance of first collisions along the ray, in world lengths; infinite without any |
 //! | `standard_error.` + `R` `G` `B` `A` | of the film's light and alpha |
 //! | `samples.Y` | paths of the pixel |
 //!
-//! `Z` and `samples.Y` are 32-bit floats in files of either precision; distances beyond 65504 are common. What the scene was
-//! is written as attributes of type `string`, in UTF-8.
+//! `Z` and `samples.Y` are 32-bit floats in files of either precision; distances beyond 65504 are common.
+//! What the scene was is written as attributes of type `string`, in UTF-8.
 //!
 //! Plain pictures are [`exr`](super::exr)'s.
 
@@ -26,14 +26,14 @@ use super::exr::{ExrPrecision, to_half};
 use super::{OutputError, check};
 use crate::film::{Film, Image, Tally};
 
-/// A film as an OpenEXR file of several layers. `beauty` is its picture, with whatever was done to it (a background, less
-/// noise); `attributes` are names and values for the file's head.
+/// A film as an OpenEXR file of several layers. `beauty` is its picture, with whatever was done to it (a
+/// background, less noise); `attributes` are names and values for the file's head.
 ///
 /// The same film gives the same bytes.
 ///
 /// # Errors
-/// If the picture is not of the film's size, an attribute's name is empty, longer than 255 bytes, given twice or one
-/// that OpenEXR defines, or if the encoder refuses.
+/// If the picture is not of the film's size, an attribute's name is empty, longer than 255 bytes, given twice
+/// or one that OpenEXR defines, or if the encoder refuses.
 pub fn encode_layers(
     beauty: &Image,
     film: &Film,
@@ -67,6 +67,9 @@ pub fn encode_layers(
     Ok(file)
 }
 
+/// One of the colours of a pixel.
+type Colour = fn(&Tally) -> [f32; 3];
+
 fn channels(beauty: &Image, film: &Film, precision: ExrPrecision) -> Vec<AnyChannel<FlatSamples>> {
     let exact = |name: &str, values: Vec<f32>| AnyChannel::new(name, FlatSamples::F32(values));
     let channel = |name: &str, values: Vec<f32>| match precision {
@@ -80,7 +83,7 @@ fn channels(beauty: &Image, film: &Film, precision: ExrPrecision) -> Vec<AnyChan
         exact("Z", film.map(Tally::depth)),
         exact("samples.Y", film.map(|tally| tally.samples as f32)),
     ];
-    let colours: [(&str, fn(&Tally) -> [f32; 3]); 4] = [
+    let colours: [(&str, Colour); 4] = [
         ("emission", Tally::emission),
         ("direct", Tally::direct),
         ("indirect", Tally::indirect),
@@ -97,8 +100,8 @@ fn channels(beauty: &Image, film: &Film, precision: ExrPrecision) -> Vec<AnyChan
     channels
 }
 
-/// Puts the attributes of a file's head in the order of their names: the encoder's own order is that of a hash map, which
-/// differs from run to run. `None` if the bytes are no such file.
+/// Puts the attributes of a file's head in the order of their names: the encoder's own order is that of a
+/// hash map, which differs from run to run. `None` if the bytes are no such file.
 fn sort_attributes(file: &mut [u8]) -> Option<()> {
     // Magic number and version, then name, type, size and value of each attribute, then an empty name.
     let first = 8;
@@ -140,8 +143,10 @@ mod tests {
         film
     }
 
+    type Attributes = Vec<(String, String)>;
+
     /// Names and values of all channels, and the attributes, by an `exr` reader.
-    fn decode(file: &[u8]) -> (Vec<(String, FlatSamples)>, Vec<(String, String)>) {
+    fn decode(file: &[u8]) -> (Vec<(String, FlatSamples)>, Attributes) {
         let reader = read().no_deep_data().largest_resolution_level().all_channels().first_valid_layer();
         let picture = reader.all_attributes().from_buffered(Cursor::new(file)).unwrap();
         let layer = picture.layer_data;
