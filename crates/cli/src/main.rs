@@ -6,6 +6,8 @@
 
 mod convert;
 mod demo;
+#[expect(dead_code, reason = "no option asks for it yet")]
+mod denoise;
 mod diff;
 mod error;
 mod eval;

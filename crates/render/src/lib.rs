@@ -3,7 +3,8 @@
 //! [`scene`] says what is rendered and [`camera`] from where; [`traverse`] walks rays through the packed tree;
 //! [`blocks`] keeps
 //! decoded bricks; [`march`] integrates light along them; [`path`] follows it through any number of scatterings;
-//! [`picture`] runs both over all pixels; [`framing`] finds views and
+//! [`picture`] runs both over all pixels, and [`progressive`] paths in passes, until a picture is good enough;
+//! [`checkpoint`] keeps one that is not; [`framing`] finds views and
 //! densities for volumes that nobody described; [`film`] and [`output`] hold and encode pictures. Physics in
 //! small functions: [`phase`], [`envmap`], [`color`], [`math`]; random numbers: [`hash`], [`sampler`].
 //!
@@ -15,6 +16,7 @@
 
 pub mod blocks;
 pub mod camera;
+pub mod checkpoint;
 pub mod color;
 pub mod envmap;
 pub mod film;
@@ -26,6 +28,7 @@ pub mod output;
 pub mod path;
 pub mod phase;
 pub mod picture;
+pub mod progressive;
 pub mod sampler;
 pub mod scene;
 pub mod traverse;

@@ -1,19 +1,21 @@
-//! From a scene to a picture: pixels, samples and tiles on all cores.
+//! From a scene to a picture in one go, on all cores. Pictures of paths that grow, stop and go on are
+//! [`progressive`](crate::progressive)'s.
 //!
 //! Each pixel depends on its own coordinates alone, so the picture is the same for any number of threads.
 
+use std::sync::atomic::{AtomicU32, Ordering};
+
 use glam::DVec2;
 
-use crate::film::{Image, ImageSizeError};
-use crate::hash::{hash_pixel, hash_u32, unit_f32};
+use crate::film::{Film, Image, ImageSizeError, Tally, Tiling};
+use crate::hash::{hash_pixel, unit_f32};
 use crate::march::{Marcher, Quality, Worker};
-use crate::path::{PathSettings, PathTracer, PathWorker};
+use crate::path::PathSettings;
+use crate::progressive::{self, Plan, Watch};
 use crate::scene::Scene;
 
-/// Pixels per side of a tile, the unit of work of a thread.
-const TILE: u32 = 16;
-
-/// Renders a scene by marching. The picture's alpha is 1 − transmittance; nothing stands behind the medium yet.
+/// Renders a scene by marching. The picture's alpha is 1 − transmittance; nothing stands behind the medium
+/// yet.
 ///
 /// `progress` is called with tiles done and tiles in all, from any thread.
 ///
@@ -42,7 +44,18 @@ pub fn render<'s>(
         }
         sum.map(|value| value / samples as f32)
     };
-    image.pixels = each_pixel([width, height], || marcher.worker(), pixel, progress);
+    let tiling = Tiling { width, height };
+    let mut tiles = vec![Vec::new(); tiling.count() as usize];
+    let done = AtomicU32::new(0);
+    each_tile(
+        &mut tiles,
+        || marcher.worker(),
+        |worker, index, tile: &mut Vec<[f32; 4]>| {
+            tile.extend(tiling.pixels(index).map(|[x, y]| pixel(worker, x, y)));
+            progress(done.fetch_add(1, Ordering::Relaxed) + 1, tiling.count());
+        },
+    );
+    image.pixels = tiling.rows(tiles);
     Ok(image)
 }
 
@@ -55,8 +68,8 @@ pub struct Traced {
     pub standard_error: Vec<[f32; 4]>,
 }
 
-/// Renders a scene by tracing `paths` paths per pixel. Nothing stands behind the medium yet. Pictures of different seeds are
-/// independent.
+/// Renders a scene by tracing `paths` paths per pixel, all in one go ([`progressive`] has the choice).
+/// Nothing stands behind the medium yet. Pictures of different seeds are independent.
 ///
 /// `progress` is called with tiles done and tiles in all, from any thread.
 ///
@@ -70,72 +83,32 @@ pub fn trace<'s>(
     [width, height]: [u32; 2],
     progress: &(dyn Fn(u32, u32) + Sync),
 ) -> Result<Traced, ImageSizeError> {
-    let mut image = Image::new(width, height)?;
-    let tracer = PathTracer::new(scene, settings);
+    let mut film = Film::new(width, height)?;
     let paths = paths.max(1);
-    let pixel = |worker: &mut PathWorker<'s>, x: u32, y: u32| {
-        // Welford's method: sums of squares would lose the small differences of bright pixels.
-        let (mut mean, mut spread) = ([0.0_f64; 4], [0.0_f64; 4]);
-        for path in 0..paths {
-            let number = |dimension| hash_pixel(x, y, path, hash_u32(seed).wrapping_add(dimension));
-            let offset = DVec2::new(unit_f32(number(0)).into(), unit_f32(number(1)).into());
-            let ray = scene.camera.ray(DVec2::new(x.into(), y.into()) + offset, width, height);
-            let sample = tracer.sample(worker, &ray, number(2));
-            let [r, g, b] = sample.light().to_array();
-            for (i, value) in [r, g, b, f32::from(!sample.passed)].into_iter().enumerate() {
-                let from_mean = f64::from(value) - mean[i];
-                mean[i] += from_mean / f64::from(path + 1);
-                spread[i] += from_mean * (f64::from(value) - mean[i]);
-            }
-        }
-        let freedom = f64::from(paths) * f64::from(paths.max(2) - 1);
-        (mean.map(|mean| mean as f32), spread.map(|spread| (spread / freedom).sqrt() as f32))
-    };
-    let pixels = each_pixel([width, height], || tracer.worker(), pixel, progress);
-    let (means, standard_error) = pixels.into_iter().unzip();
-    image.pixels = means;
-    Ok(Traced { image, standard_error })
+    let plan = Plan { settings, seed, samples: paths, pass_samples: paths, ..Plan::default() };
+    let tiles = film.tiling.count();
+    let tile = |share: f64| progress((share * f64::from(tiles)).round() as u32, tiles);
+    progressive::trace(scene, &plan, &mut film, &mut Watch { tile: Some(&tile), ..Watch::default() });
+    Ok(Traced { image: film.image(), standard_error: film.map(Tally::standard_error) })
 }
 
-/// What `pixel` makes of each pixel, row by row, on all cores. Each thread has a worker of its own.
-fn each_pixel<W, P: Copy + Default + Send>(
-    [width, height]: [u32; 2],
+/// Does some work on every tile, on all cores. Each thread has a worker of its own.
+pub(crate) fn each_tile<W, T: Send>(
+    tiles: &mut [T],
     worker: impl Fn() -> W + Sync + Send,
-    pixel: impl Fn(&mut W, u32, u32) -> P + Sync + Send,
-    progress: &(dyn Fn(u32, u32) + Sync),
-) -> Vec<P> {
-    let (columns, rows) = (width.div_ceil(TILE), height.div_ceil(TILE));
-    let done = std::sync::atomic::AtomicU32::new(0);
-    let corner = |tile: u32| [tile % columns * TILE, tile / columns * TILE];
-    let make_tile = |worker: &mut W, tile: u32| -> Vec<P> {
-        let [left, top] = corner(tile);
-        let [across, down] = [TILE.min(width - left), TILE.min(height - top)];
-        let pixels = (0..across * down).map(|i| pixel(worker, left + i % across, top + i / across));
-        let pixels = pixels.collect();
-        let done = done.fetch_add(1, std::sync::atomic::Ordering::Relaxed) + 1;
-        progress(done, columns * rows);
-        pixels
-    };
+    work: impl Fn(&mut W, u32, &mut T) + Sync + Send,
+) {
     #[cfg(feature = "parallel")]
-    let tiles: Vec<Vec<P>> = {
+    {
         use rayon::prelude::*;
-        (0..columns * rows).into_par_iter().map_init(worker, make_tile).collect()
-    };
-    #[cfg(not(feature = "parallel"))]
-    let tiles: Vec<Vec<P>> = {
-        let mut worker = worker();
-        (0..columns * rows).map(|tile| make_tile(&mut worker, tile)).collect()
-    };
-    let mut all = vec![P::default(); width as usize * height as usize];
-    for (tile, pixels) in (0..).zip(&tiles) {
-        let [left, top] = corner(tile);
-        let across = TILE.min(width - left) as usize;
-        for (row, pixels) in (top as usize..).zip(pixels.chunks(across)) {
-            let begin = row * width as usize + left as usize;
-            all[begin..begin + across].copy_from_slice(pixels);
-        }
+        let tiles = tiles.par_iter_mut().enumerate();
+        tiles.for_each_init(worker, |worker, (index, tile)| work(worker, index as u32, tile));
     }
-    all
+    #[cfg(not(feature = "parallel"))]
+    {
+        let mut worker = worker();
+        (0..).zip(tiles).for_each(|(index, tile)| work(&mut worker, index, tile));
+    }
 }
 
 /// Where in its pixel a sample lies: the centre if it is the only one, else spread evenly (the additive

@@ -29,7 +29,7 @@ pub fn encode_exr(image: &Image, precision: ExrPrecision) -> Result<Vec<u8>, Out
 }
 
 /// The nearest half float; the largest finite one for what is beyond it; NaN for NaN.
-fn to_half(value: f32) -> f16 {
+pub(super) fn to_half(value: f32) -> f16 {
     f16::from_f32(value.clamp(f16::MIN.to_f32(), f16::MAX.to_f32()))
 }
 

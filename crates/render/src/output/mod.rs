@@ -1,10 +1,12 @@
-//! Pictures as files in memory: [`png`] for looking at, [`exr`] for measuring and compositing. The encoders
-//! return bytes and know no file system; the same picture always gives the same bytes.
+//! Pictures as files in memory: [`png`] for looking at, [`exr`] for measuring and compositing, [`layers`]
+//! with all that a film knows beside the picture. The encoders return bytes and know no file system; the same
+//! picture always gives the same bytes.
 //!
 //! Exposure and backgrounds are applied before ([`film`](crate::film)); the transfer curve is
 //! [`color`](crate::color)'s.
 
 pub mod exr;
+pub mod layers;
 pub mod png;
 
 use crate::film::{Image, ImageSizeError, pixel_count};
