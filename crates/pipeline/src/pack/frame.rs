@@ -10,6 +10,7 @@ use nuage_vdb::{AnyTree, Grid, LEVEL5, Metadata, Tree, WriteOptions};
 use nuage_volume::build::TileSize;
 use nuage_volume::codec::Codec;
 use nuage_volume::format::{Quality, Role};
+use nuage_volume::space::BRICK_VOXELS;
 
 pub use super::options::{Bound, Options};
 
@@ -225,6 +226,9 @@ impl Choice {
 /// bricks.
 pub(super) const ENTRY_WORDS: f64 = 3.0;
 
+/// The same in bits per voxel: what [`Options::bits_per_voxel`] allows beyond the bricks themselves.
+pub const ENTRY_BITS_PER_VOXEL: f64 = ENTRY_WORDS * 32.0 / BRICK_VOXELS as f64;
+
 /// What a channel's bricks have to keep to, over all frames, squared errors in its unit.
 fn target(planned: &ChannelPlan, options: &Options) -> Target {
     let options = options.for_channel(&planned.key.grid);
@@ -241,7 +245,7 @@ fn target(planned: &ChannelPlan, options: &Options) -> Target {
             .map(|decibels| (voxels * peak.powi(2) / 10.0_f64.powf(decibels / 10.0) - squared).max(0.0)),
         words: options
             .bits_per_voxel
-            .map(|bits| ((bits * 16.0 - ENTRY_WORDS) * planned.bricks as f64).max(0.0) as u64),
+            .map(|bits| ((bits - ENTRY_BITS_PER_VOXEL) * 16.0 * planned.bricks as f64).max(0.0) as u64),
     }
 }
 
