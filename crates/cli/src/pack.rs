@@ -34,7 +34,8 @@ pub(crate) struct PackArgs {
     #[arg(long, value_name = "[NAME=]DB", value_parser = |text: &str| asked(text, amount))]
     psnr: Vec<Asked<f64>>,
 
-    /// The most bits per voxel of bricks that are not constant, in .nuage files
+    /// The most bits per voxel of bricks that are not constant, in .nuage files. A density's are spent where light gets;
+    /// with --psnr as well, where errors are largest
     #[arg(long, value_name = "[NAME=]BITS", value_parser = |text: &str| asked(text, amount))]
     bits_per_voxel: Vec<Asked<f64>>,
 

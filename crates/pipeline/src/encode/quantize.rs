@@ -116,7 +116,13 @@ impl<'a> Measure<'a> {
     /// The codecs to be tried unless one is asked for, the cheapest first. The last can hold any brick.
     pub fn codecs(&self) -> impl Iterator<Item = Codec> + use<> {
         let sparse = self.sparse.as_ref().map_or(Vec::new(), Sparse::codecs);
-        let (mut sparse, mut others) = (sparse.into_iter().peekable(), CODECS.into_iter().peekable());
+        // Where much is empty, codes for all voxels do not pay.
+        let is_tried = match self.sparse.as_ref().is_some_and(Sparse::is_mostly_empty) {
+            true => |codec: &Codec| !has_codes(*codec),
+            false => |_: &Codec| true,
+        };
+        let others = CODECS.into_iter().filter(is_tried);
+        let (mut sparse, mut others) = (sparse.into_iter().peekable(), others.peekable());
         std::iter::from_fn(move || match (sparse.peek(), others.peek()) {
             (Some(one), Some(other)) if one.word_count() < other.word_count() => sparse.next(),
             _ => others.next(),
@@ -162,6 +168,17 @@ impl<'a> Measure<'a> {
             Codec::F32 => Some(Error::default()),
             Codec::Shared => best_shared(values, scale, shapes).map(|(error, _)| error),
         }
+    }
+}
+
+/// Whether a codec has codes of two bits or more for all voxels.
+fn has_codes(codec: Codec) -> bool {
+    match codec {
+        Codec::Uniform { bits }
+        | Codec::Gradient { bits }
+        | Codec::Lattice { bits }
+        | Codec::Split { bits } => bits > 1,
+        _ => false,
     }
 }
 
@@ -467,7 +484,7 @@ pub(super) fn quantized_error(
 }
 
 /// What the processor can do. All of it gives the same numbers.
-static SIMD: LazyLock<Level> = LazyLock::new(Level::new);
+pub(super) static SIMD: LazyLock<Level> = LazyLock::new(Level::new);
 
 #[inline(always)]
 fn quantized_error_on(
