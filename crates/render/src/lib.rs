@@ -1,6 +1,6 @@
 //! The CPU renderer: the reference that every other renderer of the project is held to.
 //!
-//! [`scene`] says what is rendered and [`camera`] from where; [`traverse`] walks rays through the packed tree;
+//! [`scene`] says what is rendered, [`light`] what lights it, and [`camera`] from where; [`traverse`] walks rays through the packed tree;
 //! [`blocks`] keeps
 //! decoded bricks; [`march`] integrates light along them; [`path`] follows it through any number of scatterings;
 //! [`picture`] runs both over all pixels; [`framing`] finds views and
@@ -19,6 +19,7 @@ pub mod color;
 pub mod film;
 pub mod framing;
 pub mod hash;
+pub mod light;
 pub mod march;
 pub mod math;
 pub mod output;
@@ -26,4 +27,5 @@ pub mod path;
 pub mod phase;
 pub mod picture;
 pub mod scene;
+mod solid;
 pub mod traverse;

@@ -5,6 +5,8 @@
 
 mod reference;
 
+use glam::Vec3;
+use nuage_render::light::Sky;
 use nuage_render::path::PathSettings;
 use nuage_render::picture::{Traced, trace};
 use nuage_render::scene::Scene;
@@ -19,7 +21,8 @@ fn traced(scene: &Scene, settings: PathSettings, paths: u32, seed: u32) -> Trace
 fn compare(name: &str, scene: &Scene, traced: &Traced) {
     let read = |what: &str| read_f32(&path(&format!("{name}_{what}.npy")));
     let (mean, stderr) = (read("mean"), read("stderr"));
-    let image = traced.image.over(scene.sky);
+    let sky = scene.sky.radiance(Vec3::Y).to_array();
+    let image = traced.image.over(sky);
     let pixels = (SIZE * SIZE) as usize;
     let (mut good, mut blocks, mut worst) = (0, 0, 0.0_f64);
     for channel in 0..3 {
@@ -28,7 +31,7 @@ fn compare(name: &str, scene: &Scene, traced: &Traced) {
         let variance = |i: usize| {
             let [own, alpha] =
                 [traced.standard_error[i][channel], traced.standard_error[i][3]].map(f64::from);
-            (own + alpha * f64::from(scene.sky[channel])).powi(2)
+            (own + alpha * f64::from(sky[channel])).powi(2)
         };
         let theirs = |i: usize| f64::from(mean[3 * i + channel]);
         let sum = |f: &dyn Fn(usize) -> f64| (0..pixels).map(f).sum::<f64>() / pixels as f64;
@@ -79,7 +82,8 @@ fn a_furnace_is_white() {
     let (json, density) = (json(), channel("density"));
     let mut scene = lit_scene(&json, &density, 0.5);
     scene.camera = camera(&json);
-    (scene.sun, scene.sky, scene.medium.albedo) = (None, [1.0; 3], [1.0; 3]);
+    (scene.lights, scene.sky) = (Vec::new(), Sky::Constant([1.0; 3]));
+    scene.volumes[0].albedo = [1.0; 3];
     let blind = traced(&scene, PathSettings { sky_rays: false, ..PathSettings::default() }, 4, 3);
     for pixel in &blind.image.over([1.0; 3]).pixels {
         assert!(pixel[..3].iter().all(|value| (value - 1.0).abs() < 1e-4), "{pixel:?}");
