@@ -143,6 +143,10 @@ pub(crate) struct Look {
     #[arg(long, default_value = "8", value_parser = clap::value_parser!(u32).range(1..=65536), value_name = "N", help_heading = "Quality")]
     pub(crate) sky_rays: u32,
 
+    /// Which random numbers --integrator path takes: pictures of different numbers are independent
+    #[arg(long, default_value = "0", value_name = "N", help_heading = "Quality")]
+    pub(crate) seed: u32,
+
     /// With --integrator path, see the sky only by paths that leave the volumes, not by rays of their own
     #[arg(long, help_heading = "Quality")]
     pub(crate) no_sky_rays: bool,

@@ -316,7 +316,7 @@ impl Shot {
             Integrator::Path => {
                 let settings =
                     PathSettings { max_scatterings: look.scatterings, sky_rays: !look.no_sky_rays };
-                picture::trace(scene, settings, look.samples, 0, [width, height], progress)?.image
+                picture::trace(scene, settings, look.samples, look.seed, [width, height], progress)?.image
             }
         };
         let image = match look.background {

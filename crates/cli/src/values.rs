@@ -108,7 +108,7 @@ pub(crate) fn field_of_view(text: &str) -> Result<f64, String> {
     }
 }
 
-/// A picture size, `WIDTHxHEIGHT` or one number for a square.
+/// A picture size, `WIDTHxHEIGHT`, `WIDTH,HEIGHT` or one number for a square.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Size {
     pub(crate) width: u32,
@@ -120,7 +120,7 @@ impl FromStr for Size {
 
     fn from_str(text: &str) -> Result<Self, String> {
         let side = |part: &str| part.trim().parse::<u32>().ok().filter(|n| *n > 0);
-        let (width, height) = text.split_once(['x', 'X']).unwrap_or((text, text));
+        let (width, height) = text.split_once(['x', 'X', ',']).unwrap_or((text, text));
         match (side(width), side(height)) {
             (Some(width), Some(height)) => match nuage_render::film::pixel_count(width, height) {
                 Ok(_) => Ok(Size { width, height }),

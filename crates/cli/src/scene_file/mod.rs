@@ -101,6 +101,7 @@ fn parse(text: &str, folder: &Path, look: &Look, given: &Given) -> Result<(Plan,
         })?;
         put(given, "integrator", &mut look.integrator, kind);
         put(given, "samples", &mut look.samples, integrator.parsed("samples", count(1, 65536))?);
+        put(given, "seed", &mut look.seed, integrator.parsed("seed", count(0, u32::MAX))?);
         let scatterings = integrator.parsed("scatterings", count(0, 1_000_000))?;
         put(given, "scatterings", &mut look.scatterings, scatterings.map(Some));
         put(given, "step", &mut look.step, integrator.parsed("step", values::positive)?);

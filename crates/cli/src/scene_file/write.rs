@@ -51,6 +51,7 @@ pub(crate) fn save(plan: &Plan, run: &RunKeys, folder: &Path) -> String {
         vec![
             ("kind", kind),
             ("samples", Some(look.samples.to_string())),
+            ("seed", Some(look.seed.to_string())),
             ("scatterings", look.scatterings.map(|most| most.to_string())),
             ("step", Some(look.step.to_string())),
             ("shadow_step", Some(look.shadow_step.to_string())),
