@@ -156,7 +156,8 @@ fn transmittance_and_emission_follow_the_quadrature() {
     };
     // Paths that pass are counted: where hardly any does, a few of them do not tell their own error.
     let through = colours("trans_box4x4.f64", [1.0; 3]);
-    let counted: Vec<f64> = through.iter().map(|share| (share * (1.0 - share) / 72.0).max(0.0).sqrt()).collect();
+    let counted: Vec<f64> =
+        through.iter().map(|share| (share * (1.0 - share) / 72.0).max(0.0).sqrt()).collect();
     holds("het64_trans", 6, "12", &through, &counted);
     holds("emission", 6, "12", &colours("emit_box4x4.f64", [6.0, 2.5, 0.8]), &exact);
 }
@@ -164,7 +165,9 @@ fn transmittance_and_emission_follow_the_quadrature() {
 /// Nothing is lost in a medium that absorbs nothing: it cannot be seen before a sky of the same light.
 #[test]
 fn furnaces_are_white() {
-    for (name, samples) in [("het64_furnace", "64"), ("homog_cube_furnace", "224"), ("homog_sphere_furnace", "160")] {
+    for (name, samples) in
+        [("het64_furnace", "64"), ("homog_cube_furnace", "224"), ("homog_sphere_furnace", "160")]
+    {
         let blind = pictures(name, 1, &["--samples", "2", "--no-sky-rays"]);
         for pixel in blind.iter().flatten() {
             assert!(pixel[..3].iter().all(|value| (value - 1.0).abs() < 1e-4), "{name}: {pixel:?}");

@@ -362,8 +362,9 @@ impl<'s> PathTracer<'s> {
     ) -> (Option<Collision<'t, 's>>, f64) {
         let mut told = 0.0;
         let media = self.media.iter().zip(readers);
-        let mut fronts: Vec<Front<'_, 't, 's>> =
-            media.filter_map(|(medium, reader)| Front::new(medium, reader.as_mut(), ray, random)).collect();
+        let mut fronts: Vec<Front<'_, 't, 's>> = media
+            .filter_map(|(medium, reader)| Front::new(medium, reader.as_mut(), ray, carried.colours, random))
+            .collect();
         loop {
             let nearest = fronts.iter_mut().min_by(|a, b| a.next.total_cmp(&b.next));
             let Some(front) = nearest.filter(|front| front.next < f64::INFINITY) else { return (None, told) };
@@ -377,12 +378,12 @@ impl<'s> PathTracer<'s> {
                     *emitted += carried.worth() * self.emitted(glows, ray, [told, distance], random);
                     told = distance;
                 }
-                carried.turns(front.medium.shares * part, random)
+                carried.turns((front.medium.shares * (part / front.live)).min(Vec3::ONE), random)
             };
             if is_real {
                 return (Some(Collision { distance, medium: front.medium }), told);
             }
-            front.advance(random);
+            front.advance(carried.colours, random);
         }
     }
 
@@ -547,6 +548,8 @@ struct Front<'r, 't, 's> {
     medium: &'t Medium<'s>,
     /// Its distance along the ray; infinite if there is none.
     next: f64,
+    /// Of the strongest colour's extinction, the share of which it was made.
+    live: f32,
     place: Place<'r, 't, 's>,
 }
 
@@ -572,6 +575,7 @@ impl<'r, 't, 's> Front<'r, 't, 's> {
         medium: &'t Medium<'s>,
         reader: Option<&'r mut Reader<'s>>,
         ray: &Ray,
+        colours: Vec3,
         random: &mut Random,
     ) -> Option<Self> {
         let (next, place) = match (&medium.region, reader) {
@@ -589,14 +593,21 @@ impl<'r, 't, 's> Front<'r, 't, 's> {
             }
             (Region::Field(_), None) => return None,
         };
-        let mut front = Front { medium, next, place };
-        front.advance(random);
+        let mut front = Front { medium, next, live: 1.0, place };
+        front.advance(colours, random);
         Some(front)
     }
 
-    /// Moves on to the next tentative collision.
-    fn advance(&mut self, random: &mut Random) {
-        let scale = self.medium.scale;
+    /// Moves on to the next tentative collision. A colour that the path has no share of needs no majorant.
+    fn advance(&mut self, colours: Vec3, random: &mut Random) {
+        if !self.medium.is_grey {
+            self.live = Vec3::select(colours.cmpgt(Vec3::ZERO), self.medium.shares, Vec3::ZERO).max_element();
+        }
+        let scale = self.medium.scale * self.live;
+        if scale <= 0.0 {
+            self.next = f64::INFINITY;
+            return;
+        }
         let mut depth = random.depth();
         self.next = match &mut self.place {
             Place::Solid { end } => {
@@ -624,7 +635,7 @@ impl<'r, 't, 's> Front<'r, 't, 's> {
         match &mut self.place {
             Place::Solid { .. } => 1.0,
             Place::Field { segment, .. }
-                if segment.min == segment.max || segment.max * self.medium.scale > OPAQUE =>
+                if segment.min == segment.max || segment.max * self.medium.scale * self.live > OPAQUE =>
             {
                 1.0
             }

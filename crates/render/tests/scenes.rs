@@ -19,7 +19,7 @@ const SIDE: u32 = 16;
 fn means(scene: &Scene<'_>, settings: PathSettings, paths: u32) -> [(Vec3, Vec3); 2] {
     let tracer = PathTracer::new(scene, settings);
     let mut worker = tracer.worker();
-    let mut sums = [[glam::DVec3::ZERO; 2]; 2];
+    let mut sums = [[DVec3::ZERO; 2]; 2];
     let count = paths * SIDE * SIDE;
     for i in 0..count {
         let pixel = i / paths;
@@ -46,7 +46,7 @@ fn same(what: &str, a: &Scene<'_>, b: &Scene<'_>, paths: u32) {
     println!("{what}: {:.5} and {:.5}, standard errors {:.5} and {:.5}", a.0, b.0, a.1, b.1);
     let error = (a.1 * a.1 + b.1 * b.1).map(f32::sqrt);
     assert!((a.0 - b.0).abs().cmple(4.0 * error + 1e-6).all(), "{what}: {a:?} {b:?}");
-    assert!((error / a.0.max(b.0)).max_element() < 0.03, "{what}: too noisy to tell: {a:?} {b:?}");
+    assert!((error / a.0.max(b.0)).max_element() < 0.05, "{what}: too noisy to tell: {a:?} {b:?}");
 }
 
 fn camera() -> Camera {
@@ -233,7 +233,7 @@ fn a_gradient_of_one_colour_is_an_even_sky() {
     let mut gradient = even.clone();
     let colour = [0.3, 0.4, 0.5];
     gradient.sky = Sky::Gradient { up: Vec3::Y, zenith: colour, horizon: colour, ground: colour };
-    same("sky", &even, &gradient, 30);
+    same("sky", &even, &gradient, 60);
     // Seen by rays of their own or by paths that leave: the same.
     gradient.sky = Sky::Gradient { up: Vec3::Y, zenith: [1.0; 3], horizon: [0.5; 3], ground: [0.1; 3] };
     let blind = PathSettings { sky_rays: false, ..PathSettings::default() };
