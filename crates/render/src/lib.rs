@@ -5,7 +5,7 @@
 //! decoded bricks; [`march`] integrates light along them; [`path`] follows it through any number of scatterings;
 //! [`picture`] runs both over all pixels; [`framing`] finds views and
 //! densities for volumes that nobody described; [`film`] and [`output`] hold and encode pictures. Physics in
-//! small functions: [`phase`], [`color`], [`math`], [`hash`].
+//! small functions: [`phase`], [`envmap`], [`color`], [`math`]; random numbers: [`hash`], [`sampler`].
 //!
 //! Light is scene-linear Rec.709 in f32 throughout. Distances are world lengths, steps are voxels.
 //!
@@ -16,6 +16,7 @@
 pub mod blocks;
 pub mod camera;
 pub mod color;
+pub mod envmap;
 pub mod film;
 pub mod framing;
 pub mod hash;
@@ -26,6 +27,7 @@ pub mod output;
 pub mod path;
 pub mod phase;
 pub mod picture;
+pub mod sampler;
 pub mod scene;
 mod solid;
 pub mod traverse;

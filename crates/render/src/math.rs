@@ -116,6 +116,33 @@ pub fn sin_cos_turns(turns: f32) -> (f32, f32) {
     if quarter & 2 == 0 { (sin, cos) } else { (-sin, -cos) }
 }
 
+/// The angle from the x axis to the point (`x`, `y`) in turns, from -½ to ½. Absolute error below 1e-7, and
+/// relative error below 4e-7 for small angles. 0 for the origin; no sense for infinities.
+///
+/// The arguments stand as in the standard library's `atan2`: y first. The reduced angle is at most a
+/// sixteenth of a turn; its odd polynomial is fitted for the least relative error, 2e-8 before rounding.
+#[inline]
+pub fn atan2_turns(y: f32, x: f32) -> f32 {
+    /// tan of a sixteenth of a turn.
+    const SIXTEENTH: f32 = 0.414_213_57;
+    let (across, along) = (y.abs(), x.abs());
+    let (least, most) = (across.min(along), across.max(along));
+    if most == 0.0 {
+        return 0.0;
+    }
+    // Of the tangent's two forms the one whose quotient is small; neither divides by 0.
+    let (offset, z) =
+        if least > SIXTEENTH * most { (0.125, (least - most) / (least + most)) } else { (0.0, least / most) };
+    let y2 = z * z;
+    let p = y2 * 1.271_049_5e-2 - 2.204_604_6e-2;
+    let p = p * y2 + 3.179_033_5e-2;
+    let p = p * y2 - 5.305_079_7e-2;
+    let octant = offset + z * (p * y2 + 1.591_549_4e-1);
+    let quadrant = if across > along { 0.25 - octant } else { octant };
+    let half = if x < 0.0 { 0.5 - quadrant } else { quadrant };
+    if y < 0.0 { -half } else { half }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -204,5 +231,31 @@ mod tests {
         assert_eq!(sin_cos_turns(0.25), (1.0, -0.0));
         assert_eq!(sin_cos_turns(0.5), (-0.0, -1.0));
         assert!(sin_cos_turns(f32::INFINITY).0.is_nan());
+    }
+
+    #[test]
+    fn atan2_turns_undoes_the_circle() {
+        for angle in sweep(-0.5, 0.5, 300_000) {
+            for radius in [1e-30f64, 0.3, 1.0, 1e30] {
+                let (sin, cos) = (f64::from(angle) * std::f64::consts::TAU).sin_cos();
+                let (y, x) = ((sin * radius) as f32, (cos * radius) as f32);
+                let expected = f64::from(y).atan2(f64::from(x)) / std::f64::consts::TAU;
+                // A y that rounds to 0 no longer tells -½ from ½.
+                let off = f64::from(atan2_turns(y, x)) - expected;
+                let error = (off - off.round()).abs();
+                assert!(error < 1e-7, "({x}, {y}) lies at {} instead of {expected}", atan2_turns(y, x));
+            }
+        }
+        for exponent in 1..100 {
+            let y = 2.0f32.powi(-exponent);
+            let expected = f64::from(y).atan2(1.0) / std::f64::consts::TAU;
+            let error = (f64::from(atan2_turns(y, 1.0)) / expected - 1.0).abs();
+            assert!(error < 4e-7, "{y:e} gives {}: {error:e}", atan2_turns(y, 1.0));
+        }
+        assert_eq!(atan2_turns(0.0, 0.0), 0.0);
+        assert_eq!(
+            [(0.0, 1.0), (1.0, 0.0), (0.0, -1.0), (-1.0, 0.0)].map(|(y, x)| atan2_turns(y, x)),
+            [0.0, 0.25, 0.5, -0.25]
+        );
     }
 }

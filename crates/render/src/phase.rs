@@ -2,7 +2,14 @@
 //! how much scatters is the medium's, and where along a ray is the integrator's.
 //!
 //! Angles are between the direction of travel before and the direction of travel after: cos = 1 goes straight
-//! on.
+//! on. Inside, an angle is held as its distances in cosine from both poles (`Angle`), since the lobes of
+//! droplets are so narrow that a rounded cosine no longer tells where in them it lies.
+
+mod draine;
+mod mie;
+
+pub use draine::MAX_ALPHA;
+pub use mie::Mie;
 
 use crate::math::sin_cos_turns;
 use glam::Vec3;
@@ -12,6 +19,107 @@ use std::f32::consts::PI;
 /// ray.
 pub const MAX_ASYMMETRY: f32 = 0.999;
 
+/// A phase function with its parameters.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Phase {
+    /// The Henyey–Greenstein lobe, see [`hg`].
+    HenyeyGreenstein {
+        /// The mean cosine, limited to ±[`MAX_ASYMMETRY`].
+        g: f32,
+    },
+    /// Draine's lobe: Henyey–Greenstein times 1 + α cos². With g = 0 and α = 1 it is Rayleigh's, with α = 1
+    /// that of Cornette and Shanks. Source: Draine, "Scattering by Interstellar Dust Grains. I.",
+    /// Astrophysical Journal 598 (2003).
+    Draine {
+        /// The asymmetry of the Henyey–Greenstein factor, limited to ±[`MAX_ASYMMETRY`]. Not the mean cosine.
+        g: f32,
+        /// The weight of cos², limited to 0..=[`MAX_ALPHA`].
+        alpha: f32,
+    },
+    /// Water droplets of fog and clouds.
+    Mie(Mie),
+}
+
+impl Phase {
+    /// Water droplets of a diameter in micrometres, see [`Mie::new`].
+    pub fn mie(diameter_um: f32) -> Self {
+        Phase::Mie(Mie::new(diameter_um))
+    }
+
+    /// The value [1/sr] at the cosine of the scattering angle, -1..=1. Integrates to 1 over the sphere. NaN
+    /// for NaN.
+    #[inline]
+    pub fn value(&self, cosine: f32) -> f32 {
+        self.at(Angle { ahead: 1.0 - cosine, behind: 1.0 + cosine })
+    }
+
+    /// The value [1/sr] between two directions of travel, both of length 1. Where the lobe is narrow this is
+    /// more precise than [`value`](Self::value) at their scalar product.
+    #[inline]
+    pub fn between(&self, before: Vec3, after: Vec3) -> f32 {
+        self.at(Angle::between(before, after))
+    }
+
+    /// A direction of travel after scattering, of length 1, and the value [1/sr] there, which is also the
+    /// density of such directions: samples are distributed exactly as the phase function, so the weight of
+    /// each is 1.
+    ///
+    /// `before` is the direction of travel before, of length 1. `u` are two uniform numbers in 0..=1: for the
+    /// angle (for droplets also for the choice of a lobe), and for the turn around `before`.
+    #[inline]
+    pub fn sample(&self, before: Vec3, u: [f32; 2]) -> (Vec3, f32) {
+        let angle = match *self {
+            Phase::HenyeyGreenstein { g } => sample_hg_angle(g, u[0]),
+            Phase::Draine { g, alpha } => draine::sample(g, alpha, u[0]),
+            Phase::Mie(mie) => mie.sample(u[0]),
+        };
+        (around(before, angle, u[1]), self.at(angle))
+    }
+
+    /// The mean cosine of the scattering angle.
+    pub fn mean_cosine(&self) -> f32 {
+        match *self {
+            Phase::HenyeyGreenstein { g } => g.clamp(-MAX_ASYMMETRY, MAX_ASYMMETRY),
+            Phase::Draine { g, alpha } => draine::mean_cosine(g, alpha),
+            Phase::Mie(mie) => mie.mean_cosine(),
+        }
+    }
+
+    #[inline]
+    fn at(&self, angle: Angle) -> f32 {
+        match *self {
+            Phase::HenyeyGreenstein { g } => hg_at(angle, g),
+            Phase::Draine { g, alpha } => draine::at(angle, g, alpha),
+            Phase::Mie(mie) => mie.at(angle),
+        }
+    }
+}
+
+/// A scattering angle.
+#[derive(Debug, Clone, Copy)]
+struct Angle {
+    /// 1 - cos.
+    ahead: f32,
+    /// 1 + cos.
+    behind: f32,
+}
+
+impl Angle {
+    /// The angle between two directions of length 1. An error of their lengths enters with its square only.
+    #[inline]
+    fn between(before: Vec3, after: Vec3) -> Self {
+        Angle {
+            ahead: (after - before).length_squared() / 2.0,
+            behind: (after + before).length_squared() / 2.0,
+        }
+    }
+
+    #[inline]
+    fn cosine(self) -> f32 {
+        (self.behind - self.ahead) / 2.0
+    }
+}
+
 /// The Henyey–Greenstein phase function [1/sr] at the cosine of the scattering angle, -1..=1.
 ///
 /// `g` is the mean cosine: positive scatters forward, negative backward, 0 evenly. It is limited to
@@ -20,8 +128,13 @@ pub const MAX_ASYMMETRY: f32 = 0.999;
 /// Source: Henyey and Greenstein, "Diffuse radiation in the Galaxy", Astrophysical Journal 93 (1941).
 #[inline]
 pub fn hg(cos_theta: f32, g: f32) -> f32 {
+    hg_at(Angle { ahead: 1.0 - cos_theta, behind: 1.0 + cos_theta }, g)
+}
+
+#[inline]
+fn hg_at(angle: Angle, g: f32) -> f32 {
     let a = g.clamp(-MAX_ASYMMETRY, MAX_ASYMMETRY).abs();
-    let from_peak = 1.0 - if g < 0.0 { -cos_theta } else { cos_theta };
+    let from_peak = if g < 0.0 { angle.behind } else { angle.ahead };
     // 1 + g² - 2 g cos, arranged so that nothing cancels at the peak of a narrow lobe.
     let squared = (1.0 - a) * (1.0 - a) + 2.0 * a * from_peak;
     (1.0 - a) * (1.0 + a) / (4.0 * PI * squared * squared.sqrt())
@@ -29,24 +142,44 @@ pub fn hg(cos_theta: f32, g: f32) -> f32 {
 
 /// A direction of travel after scattering, distributed exactly as [`hg`] around `direction`, the unit
 /// direction of travel before; a unit vector. `u` are two uniform numbers in 0..=1: for the angle (0 back, 1
-/// straight on, where g > 0), and for the turn around `direction`.
-///
-/// The angle inverts the cumulative distribution. The usual formula divides by g and subtracts nearly equal
-/// numbers; this one is the same distribution solved for 1 - cos, with positive terms only, so it holds for g
-/// = 0 and for narrow lobes without cases.
+/// straight on), and for the turn around `direction`.
 #[inline]
 pub fn sample_hg(direction: Vec3, g: f32, u: [f32; 2]) -> Vec3 {
-    let a = g.clamp(-MAX_ASYMMETRY, MAX_ASYMMETRY).abs();
+    around(direction, sample_hg_angle(g, u[0]), u[1])
+}
+
+#[inline]
+fn sample_hg_angle(g: f32, u: f32) -> Angle {
     // A backward lobe is the forward lobe of the opposite direction.
-    let (axis, u0) = if g < 0.0 { (-direction, 1.0 - u[0]) } else { (direction, u[0]) };
-    let ratio = (1.0 - a) / (1.0 - a + 2.0 * a * u0);
-    let from_peak = 2.0 * ratio * ratio * (1.0 - u0) * (1.0 + a * u0);
-    let sin_theta = (from_peak * (2.0 - from_peak)).max(0.0).sqrt();
-    let (sin_phi, cos_phi) = sin_cos_turns(u[1]);
-    let (tangent, bitangent) = tangent_frame(axis);
+    let a = g.clamp(-MAX_ASYMMETRY, MAX_ASYMMETRY).abs();
+    if g < 0.0 {
+        let behind = hg_from_peak(a, 1.0 - u);
+        Angle { ahead: 2.0 - behind, behind }
+    } else {
+        let ahead = hg_from_peak(a, u);
+        Angle { ahead, behind: 2.0 - ahead }
+    }
+}
+
+/// How far in cosine from the peak of a lobe of asymmetry `a` >= 0 a share `u` of the light lies beyond.
+///
+/// The usual formula divides by g and subtracts nearly equal numbers; this one is the same distribution
+/// solved for 1 - cos, with positive terms only, so it holds for g = 0 and for narrow lobes without cases.
+#[inline]
+fn hg_from_peak(a: f32, u: f32) -> f32 {
+    let ratio = (1.0 - a) / (1.0 - a + 2.0 * a * u);
+    2.0 * ratio * ratio * (1.0 - u) * (1.0 + a * u)
+}
+
+/// The direction of length 1 at an angle from `direction`, `turns` around it.
+#[inline]
+fn around(direction: Vec3, angle: Angle, turns: f32) -> Vec3 {
+    let sin_theta = (angle.ahead * angle.behind).max(0.0).sqrt();
+    let (sin_phi, cos_phi) = sin_cos_turns(turns);
+    let (tangent, bitangent) = tangent_frame(direction);
     let across = tangent * (sin_theta * cos_phi) + bitangent * (sin_theta * sin_phi);
     // Paths scatter thousands of times: without this, rounding would let the length drift.
-    (axis * (1.0 - from_peak) + across).normalize()
+    (direction * (1.0 - angle.ahead) + across).normalize()
 }
 
 /// Two unit vectors that form a right-handed orthonormal frame with the unit vector `axis` as third.
@@ -203,5 +336,87 @@ mod tests {
             assert!(worst.iter().all(|e| e.abs() < 1e-6), "{axis}: {worst:?}");
             assert!(t.cross(b).dot(axis) > 0.999, "{axis}");
         }
+    }
+
+    fn phases() -> Vec<Phase> {
+        let lobes = [0.0f32, 0.6, -0.7, 0.95].map(|g| Phase::HenyeyGreenstein { g });
+        let draine = [(0.0f32, 1.0f32), (0.5, 1.0), (0.6, 20.0), (-0.4, 250.0), (0.9, 5.0), (1e-6, 1e9)];
+        let draine = draine.map(|(g, alpha)| Phase::Draine { g, alpha });
+        let droplets = [0.0f32, 0.05, 0.12, 0.4, 1.0, 2.0, 4.81, 5.0, 10.0, 25.0, 50.0].map(Phase::mie);
+        lobes.into_iter().chain(draine).chain(droplets).collect()
+    }
+
+    #[test]
+    fn every_phase_integrates_to_one_with_its_mean_cosine() {
+        for phase in phases() {
+            let total = over_sphere(|cos| f64::from(phase.value(cos)));
+            let mean = over_sphere(|cos| f64::from(cos) * f64::from(phase.value(cos)));
+            assert!((total - 1.0).abs() < 2e-3, "{phase:?} integrates to {total}");
+            let expected = f64::from(phase.mean_cosine());
+            assert!((mean - expected).abs() < 2e-3, "{phase:?} has mean cosine {mean}, not {expected}");
+        }
+        let rayleigh = Phase::Draine { g: 0.0, alpha: 1.0 };
+        assert!((rayleigh.value(0.5) / (3.0 / (16.0 * PI) * 1.25) - 1.0).abs() < 1e-6);
+    }
+
+    #[test]
+    fn samples_of_every_phase_follow_it() {
+        // Intervals of the angle that shrink towards both poles, where droplets send most of their light.
+        let (angles, turns, count) = (24usize, 4usize, 60_000u32);
+        let edge = |i: usize| {
+            let x = 2.0 * i as f64 / angles as f64 - 1.0;
+            (x.signum() * (1.0 - (1.0 - x.abs()).powi(4))).clamp(-1.0, 1.0)
+        };
+        for (phase, before) in phases().into_iter().zip(directions().skip(2)) {
+            let (tangent, bitangent) = tangent_frame(before);
+            let mut counts = vec![0u32; angles * turns];
+            for i in 0..count {
+                let (after, pdf) = phase.sample(before, draw(i));
+                assert!((after.length() - 1.0).abs() < 1e-6);
+                let again = phase.between(before, after);
+                assert!((again / pdf - 1.0).abs() < 5e-3, "{phase:?}: {pdf} and {again}");
+                let cos = f64::from(after.dot(before));
+                let angle = (1..angles).filter(|&i| cos >= edge(i)).count();
+                let turn = (after.dot(bitangent).atan2(after.dot(tangent)) / (2.0 * PI) + 1.0).fract();
+                counts[angle * turns + ((turn * turns as f32) as usize).min(turns - 1)] += 1;
+            }
+            let (mut chi_square, mut freedom) = (0.0f64, -1.0f64);
+            for (bin, &n) in counts.iter().enumerate() {
+                let (low, high) = (edge(bin / turns), edge(bin / turns + 1));
+                let steps = 400;
+                let step = (high - low) / f64::from(steps);
+                let value = |i| f64::from(phase.value((low + (f64::from(i) + 0.5) * step) as f32));
+                let chance = (0..steps).map(value).sum::<f64>() * step * 2.0 * std::f64::consts::PI;
+                let expected = chance / turns as f64 * f64::from(count);
+                // The narrowest intervals are no wider than steps of a rounded cosine.
+                if expected > 5.0 && high - low > 1e-4 {
+                    chi_square += (f64::from(n) - expected).powi(2) / expected;
+                    freedom += 1.0;
+                }
+            }
+            let excess = (chi_square - freedom) / (2.0 * freedom).sqrt();
+            assert!(excess < 4.0, "{phase:?}: {excess} standard deviations");
+        }
+    }
+
+    #[test]
+    fn odd_parameters_and_numbers_stay_finite() {
+        let odd = [f32::INFINITY, f32::NEG_INFINITY, -5.0, 5.0, 1e-30];
+        for g in odd {
+            for alpha in odd {
+                for phase in [Phase::HenyeyGreenstein { g }, Phase::Draine { g, alpha }, Phase::mie(alpha)] {
+                    for u in
+                        [[0.0, 0.0], [1.0, 1.0], [0.5, 0.3], [1.0 - f32::EPSILON / 2.0, 0.9], [1e-7, 0.1]]
+                    {
+                        let (after, pdf) = phase.sample(Vec3::new(0.6, 0.0, 0.8), u);
+                        assert!((after.length() - 1.0).abs() < 1e-6, "{phase:?} {u:?} gives {after}");
+                        assert!(pdf.is_finite() && pdf > 0.0, "{phase:?} {u:?}: {pdf}");
+                    }
+                }
+            }
+        }
+        // What is not a number gives none, and comes to an end.
+        let (_, pdf) = Phase::Draine { g: f32::NAN, alpha: f32::NAN }.sample(Vec3::X, [f32::NAN; 2]);
+        assert!(pdf.is_nan());
     }
 }
