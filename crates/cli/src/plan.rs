@@ -28,7 +28,7 @@ pub(crate) struct VolumePlan {
     pub(crate) transform: DAffine3,
     pub(crate) extinction: Extinction,
     pub(crate) albedo: [f32; 3],
-    pub(crate) phase: f32,
+    pub(crate) phase: PhasePlan,
     pub(crate) emission: Option<EmissionPlan>,
 }
 
@@ -59,6 +59,17 @@ pub(crate) enum Extinction {
     Rgb([f32; 3]),
 }
 
+/// How a volume scatters.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) enum PhasePlan {
+    /// Henyey–Greenstein, by g.
+    Lobe(f32),
+    /// Draine, by g and α.
+    Draine([f32; 2]),
+    /// Water droplets, by their diameter in micrometres.
+    Droplets(f32),
+}
+
 /// What a volume gives off.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct EmissionPlan {
@@ -85,10 +96,20 @@ pub(crate) enum LightPlan {
 }
 
 /// The sky; its zenith is where the camera's up is.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub(crate) enum SkyPlan {
     Constant([f32; 3]),
-    Gradient { zenith: [f32; 3], horizon: [f32; 3], ground: [f32; 3] },
+    Gradient {
+        zenith: [f32; 3],
+        horizon: [f32; 3],
+        ground: [f32; 3],
+    },
+    /// A picture, turned around up and made brighter.
+    Map {
+        file: String,
+        turn_degrees: f32,
+        scale: f32,
+    },
 }
 
 /// The options that were given on the command line, by the names that clap knows them by. All others are defaults.
@@ -126,7 +147,7 @@ impl Plan {
             transform: DAffine3::IDENTITY,
             extinction: extinction(look.density),
             albedo: look.albedo,
-            phase: look.phase,
+            phase: PhasePlan::Lobe(look.phase),
             emission: emission(look),
         };
         let sun = (look.sun != SunPosition::None).then_some(LightPlan::Sun {
@@ -178,7 +199,7 @@ impl Plan {
                 volume.albedo = look.albedo;
             }
             if given.has("phase") {
-                volume.phase = look.phase;
+                volume.phase = PhasePlan::Lobe(look.phase);
             }
             if given.has("temperature") || given.has("flame") {
                 volume.emission = emission(look);

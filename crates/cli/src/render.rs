@@ -17,7 +17,7 @@ use nuage_volume::channel::IndexBox;
 use crate::error::Failure;
 use crate::frames;
 use crate::look::Look;
-use crate::plan::{Given, Plan, VolumePlan, What};
+use crate::plan::{Given, Plan, SkyPlan, VolumePlan, What};
 use crate::progress;
 use crate::scene_file::{self, RunKeys};
 use crate::shot::{self, Shot, Volume};
@@ -91,6 +91,9 @@ struct Job {
     output: PathBuf,
 }
 
+/// The number of a frame, and the files of its volumes.
+type FrameInputs = (Option<i64>, Vec<Option<PathBuf>>);
+
 /// What the frames of one volume are.
 enum Files {
     /// It comes from no file.
@@ -143,7 +146,11 @@ pub(crate) fn run(args: &Args, given: &Given) -> Result<(), Failure> {
     let (world_box, mut volumes) = look_at(&plan, &run, &frames)?;
     let loaded: Vec<Vec<Option<&Volume>>> =
         volumes.iter().map(|frame| frame.iter().map(Option::as_ref).collect()).collect();
-    let shot = Shot::of_plan(plan, world_box, &loaded).map_err(Failure::Usage)?;
+    let mut shot = Shot::of_plan(plan, world_box, &loaded).map_err(Failure::Usage)?;
+    if let SkyPlan::Map { file, .. } = shot.plan().sky.clone() {
+        let (size, texels) = picture(Path::new(&file))?;
+        shot.light_by(size, texels).map_err(|e| plain(&file, e))?;
+    }
     if run.timing {
         note(&shot.describe());
     }
@@ -186,10 +193,7 @@ fn overrule(run: &mut RunKeys, args: &Args) {
 }
 
 /// The frames to be rendered, each with its number and the files of its volumes.
-fn find_inputs(
-    plan: &Plan,
-    range: Option<&FrameRange>,
-) -> Result<Vec<(Option<i64>, Vec<Option<PathBuf>>)>, Failure> {
+fn find_inputs(plan: &Plan, range: Option<&FrameRange>) -> Result<Vec<FrameInputs>, Failure> {
     let is_alone = plan.volumes.len() == 1;
     let found = plan.volumes.iter().map(|volume| match &volume.what {
         What::File { input, .. } => files(input, range, is_alone),
@@ -292,7 +296,7 @@ type Volumes = Vec<Vec<Option<Volume>>>;
 fn look_at(
     plan: &Plan,
     run: &RunKeys,
-    frames: &[(Option<i64>, Vec<Option<PathBuf>>)],
+    frames: &[FrameInputs],
 ) -> Result<(Option<WorldBox>, Volumes), Failure> {
     if let [(_, inputs)] = frames {
         let start = Instant::now();
@@ -377,6 +381,42 @@ fn load(plan: &Plan, inputs: &[Option<PathBuf>], warnings: bool) -> Result<Vec<O
         Ok(Some(volume))
     };
     plan.volumes.iter().zip(inputs).map(load).collect()
+}
+
+/// The size and the pixels of a picture in OpenEXR.
+fn picture(path: &Path) -> Result<([u32; 2], Vec<[f32; 3]>), Failure> {
+    use exr::prelude::{ReadChannels, ReadLayers};
+    type Pixels = (usize, Vec<[f32; 3]>);
+    // Opened by ourselves: a folder or a pipe is refused, and so is a header that asks for too much.
+    let disk = DiskFile::open_plain(path)?;
+    let bytes =
+        nuage_volume::format::ReadAt::range(&disk, 0, usize::try_from(disk.size()).unwrap_or(usize::MAX));
+    let bytes = bytes.map_err(|e| plain(path, e))?;
+    let meta = exr::meta::MetaData::read_from_buffered(bytes.as_ref(), false).map_err(|e| plain(path, e))?;
+    for header in &meta.headers {
+        let [width, height] = [header.layer_size.width(), header.layer_size.height()];
+        let side = |side: usize| u32::try_from(side).unwrap_or(u32::MAX);
+        nuage_render::film::pixel_count(side(width), side(height)).map_err(|e| plain(path, e))?;
+    }
+    let read = exr::prelude::read()
+        .no_deep_data()
+        .largest_resolution_level()
+        .rgb_channels(
+            |size, _| -> Pixels { (size.width(), vec![[0.0; 3]; size.width() * size.height()]) },
+            |(width, pixels): &mut Pixels, at, (r, g, b): (f32, f32, f32)| {
+                if let Some(pixel) = pixels.get_mut(at.y() * *width + at.x()) {
+                    *pixel = [r, g, b];
+                }
+            },
+        )
+        .first_valid_layer()
+        .all_attributes()
+        .from_buffered(io::Cursor::new(bytes.as_ref()))
+        .map_err(|e| plain(path, e))?;
+    let (width, pixels) = read.layer_data.channel_data.pixels;
+    let height = pixels.len() / width.max(1);
+    let side = |side: usize| u32::try_from(side).unwrap_or(0);
+    Ok(([side(width), side(height)], pixels))
 }
 
 type Encode = Box<dyn Fn(&Image) -> Result<Vec<u8>, nuage_render::output::OutputError>>;

@@ -4,11 +4,14 @@
 //! the plan with everything settled that it left open, the camera and the scales of density and emission. The choices
 //! themselves are made by the libraries.
 
+use std::sync::Arc;
+
 use glam::{DAffine3, DVec3};
 use nuage_pipeline::import::{self, Report};
 use nuage_pipeline::select;
 use nuage_render::camera::Camera;
 use nuage_render::color::Blackbody;
+use nuage_render::envmap::{self, EnvironmentMap};
 use nuage_render::film::{Image, ImageSizeError};
 use nuage_render::framing::{self, WorldBox};
 use nuage_render::light::{Light, Sky, Sun};
@@ -21,7 +24,7 @@ use nuage_volume::channel::Channel;
 
 use crate::error::explain;
 use crate::look::{Integrator, Look};
-use crate::plan::{EmissionPlan, Extinction, Glow, LightPlan, Plan, SkyPlan};
+use crate::plan::{EmissionPlan, Extinction, Glow, LightPlan, PhasePlan, Plan, SkyPlan};
 use crate::values::{Auto, Background, Size};
 
 /// The temperature at which a black body has the stated luminance.
@@ -59,6 +62,8 @@ pub(crate) struct Shot {
     plan: Plan,
     camera: Camera,
     spectra: Vec<Option<Spectrum>>,
+    /// The picture of the sky, if the plan names one.
+    map: Option<Arc<EnvironmentMap>>,
 }
 
 /// The positions in the file of the density grid and of the grid that glows.
@@ -191,7 +196,24 @@ impl Shot {
             *scale = Auto::Value(value);
             spectra.push(Some(unscaled.brighter(value)));
         }
-        Ok(Shot { plan, camera, spectra })
+        Ok(Shot { plan, camera, spectra, map: None })
+    }
+
+    /// Lights it by a picture of radiance of so many columns and rows, as the plan says.
+    ///
+    /// # Errors
+    /// What is wrong with the picture, in words.
+    pub(crate) fn light_by(
+        &mut self,
+        [width, height]: [u32; 2],
+        mut texels: Vec<[f32; 3]>,
+    ) -> Result<(), String> {
+        let SkyPlan::Map { turn_degrees, scale, .. } = self.plan.sky else { return Ok(()) };
+        texels.iter_mut().flatten().for_each(|light| *light *= scale);
+        let world_from_map = envmap::orientation(self.plan.look.up.as_vec3(), turn_degrees / 360.0);
+        let map = EnvironmentMap::new(width, height, texels, world_from_map).map_err(|e| e.to_string())?;
+        self.map = Some(Arc::new(map));
+        Ok(())
     }
 
     /// The view.
@@ -245,7 +267,11 @@ impl Shot {
             };
             let channel = loaded.and_then(|volume| volume.emission.as_ref());
             let emission = spectrum.clone().map(|spectrum| Emission { channel, spectrum });
-            let phase = Phase::HenyeyGreenstein { g: plan.phase };
+            let phase = match plan.phase {
+                PhasePlan::Lobe(g) => Phase::HenyeyGreenstein { g },
+                PhasePlan::Draine([g, alpha]) => Phase::Draine { g, alpha },
+                PhasePlan::Droplets(diameter_um) => Phase::mie(diameter_um),
+            };
             Some(scene::Volume { shape, extinction, albedo: plan.albedo, phase, emission })
         });
         let z_up = z_is_up(look);
@@ -257,6 +283,8 @@ impl Shot {
         });
         let sky = match *sky {
             SkyPlan::Constant(radiance) => Sky::Constant(radiance),
+            // Without a picture there is no light of it.
+            SkyPlan::Map { .. } => self.map.clone().map_or(Sky::Constant([0.0; 3]), Sky::Map),
             SkyPlan::Gradient { zenith, horizon, ground } => {
                 Sky::Gradient { up: look.up.as_vec3(), zenith, horizon, ground }
             }

@@ -260,6 +260,28 @@ emission = { color = [0.1, 0.3, 0.1] }
 "#;
 
 #[test]
+fn a_picture_of_an_even_sky_is_an_even_sky() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name).display().to_string();
+    exr::prelude::write_rgb_file(at("sky.exr"), 16, 8, |_, _| (0.25_f32, 0.5_f32, 1.0_f32)).unwrap();
+    let mean = |name: &str, sky: &str| {
+        let volume = "[[volumes]]\nsphere = { radius = 1 }\nextinction = 2\nphase = { droplets = 8 }\n";
+        let text =
+            format!("[film]\nsize = 24\n[integrator]\nkind = \"path\"\nsamples = 48\n[sky]\n{sky}\n{volume}");
+        fs::write(at(name), text).unwrap();
+        done(&["--scene", &at(name), "-o", &at("x.exr"), "--exr-float", "--overwrite"]);
+        let pixels = exr(Path::new(&at("x.exr")));
+        assert_eq!(pixels[0], [0.5, 1.0, 2.0, 1.0], "the sky in the corner");
+        pixels.iter().map(|pixel| f64::from(pixel[1])).sum::<f64>() / pixels.len() as f64
+    };
+    let (map, even) =
+        (mean("a.toml", "map = \"sky.exr\"\nscale = 2\nturn = 30"), mean("b.toml", "radiance = [0.5, 1, 2]"));
+    assert!((map / even - 1.0).abs() < 0.02, "{map} {even}");
+    fs::write(at("c.toml"), "[sky]\nmap = \"c.toml\"\n[integrator]\nkind = \"path\"\n").unwrap();
+    fails(&["--scene", &at("c.toml"), "-o", &at("y.exr")], 1, "c.toml");
+}
+
+#[test]
 fn options_overrule_the_file() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name).display().to_string();

@@ -8,10 +8,12 @@
 //! What does not live here: what a medium takes away on the way ([`crate::path`]).
 
 use std::f32::consts::PI;
+use std::sync::Arc;
 
 use glam::{DVec2, DVec3, Vec3};
 
 use crate::camera::Camera;
+use crate::envmap::EnvironmentMap;
 use crate::math::sin_cos_turns;
 use crate::phase::tangent_frame;
 
@@ -216,7 +218,7 @@ impl Spot {
 }
 
 /// Light from all directions, infinitely far away.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone)]
 pub enum Sky {
     /// The same radiance from everywhere.
     Constant([f32; 3]),
@@ -232,6 +234,8 @@ pub enum Sky {
         /// Radiance straight below.
         ground: [f32; 3],
     },
+    /// A picture of the surroundings.
+    Map(Arc<EnvironmentMap>),
 }
 
 impl Sky {
@@ -240,6 +244,7 @@ impl Sky {
     pub fn radiance(&self, direction: Vec3) -> Vec3 {
         match self {
             Sky::Constant(radiance) => Vec3::from_array(*radiance),
+            Sky::Map(map) => map.radiance(direction),
             Sky::Gradient { up, zenith, horizon, ground } => {
                 let height = up.dot(direction).clamp(-1.0, 1.0);
                 let pole = Vec3::from_array(if height < 0.0 { *ground } else { *zenith });
@@ -254,6 +259,7 @@ impl Sky {
         let black = [0.0; 3];
         match self {
             Sky::Constant(radiance) => *radiance == black,
+            Sky::Map(map) => map.is_black(),
             Sky::Gradient { zenith, horizon, ground, .. } => {
                 [zenith, horizon, ground].iter().all(|l| **l == black)
             }

@@ -13,7 +13,7 @@
 //! At each collision the light of each light and of the sky is taken with a transmittance by residual ratio tracking (Novák
 //! et al., "Residual Ratio Tracking for Estimating Attenuation in Participating Media", 2014). Of a light with extent, a
 //! direction is taken evenly from what is seen of it, or, where the phase function is narrower than the light, from either
-//! with even chances, weighed by the balance heuristic (Veach, "Robust Monte Carlo Methods for Light Transport Simulation",
+//! with even chances, weighed by the balance heuristic; of a sky that is a picture always from either (Veach, "Robust Monte Carlo Methods for Light Transport Simulation",
 //! 1997). Paths end by Russian roulette.
 //!
 //! What does not live here: pixels, threads, pictures ([`crate::picture`]).
@@ -23,8 +23,9 @@ use nuage_volume::accessor::Accessor;
 
 use crate::blocks::Blocks;
 use crate::camera::Ray;
+use crate::envmap::EnvironmentMap;
 use crate::hash::{hash_u32, unit_f32};
-use crate::light::{Arriving, Light};
+use crate::light::{Arriving, Light, Sky};
 use crate::math::{exp, ln};
 use crate::scene::{Phase, Scene, Shape, Spectrum, Volume};
 use crate::solid::Solid;
@@ -275,9 +276,14 @@ impl<'s> PathTracer<'s> {
                 Ray { origin, direction: direction.as_dvec3().normalize() }
             };
             if self.settings.sky_rays && !sky_is_black {
-                let towards = scattered(&mut random);
-                let radiance = sky.radiance(towards.direction.as_vec3());
-                light += radiance * self.transmittance(worker, &towards, f64::INFINITY, &mut random);
+                light += match sky {
+                    Sky::Map(map) => self.mapped(worker, map, origin, before, medium.phase, &mut random),
+                    Sky::Constant(_) | Sky::Gradient { .. } => {
+                        let towards = scattered(&mut random);
+                        let radiance = sky.radiance(towards.direction.as_vec3());
+                        radiance * self.transmittance(worker, &towards, f64::INFINITY, &mut random)
+                    }
+                };
             }
             let light = carried.worth() * light;
             *(if scatterings == 1 { &mut sample.direct } else { &mut sample.indirect }) += light;
@@ -323,6 +329,31 @@ impl<'s> PathTracer<'s> {
                 radiance * (scatters / density * self.transmittance(worker, &towards, distance, random))
             }
         }
+    }
+
+    /// The light of a picture of the surroundings that a point scatters along `before`, over the share of light that it
+    /// scatters at all: from a direction that the picture or the phase function chose.
+    fn mapped(
+        &self,
+        worker: &mut PathWorker<'s>,
+        map: &EnvironmentMap,
+        origin: DVec3,
+        before: Vec3,
+        phase: Phase,
+        random: &mut Random,
+    ) -> Vec3 {
+        let takes_map = random.unit() < 0.5;
+        let u = [random.unit(), random.unit()];
+        let direction = match takes_map {
+            true => map.sample(u).map(|sample| sample.direction),
+            false => Some(phase.sample(before, u).0),
+        };
+        let Some(direction) = direction else { return Vec3::ZERO };
+        let scatters = phase.between(before, direction);
+        let density = 0.5 * (scatters + map.pdf(direction));
+        let towards = Ray { origin, direction: direction.as_dvec3().normalize() };
+        let passes = self.transmittance(worker, &towards, f64::INFINITY, random);
+        if density > 0.0 { map.radiance(direction) * (scatters / density) * passes } else { Vec3::ZERO }
     }
 
     /// Where a ray collides, by delta tracking; `None` if it leaves all media. What they emit on the way is added to
@@ -554,6 +585,10 @@ struct Front<'r, 't, 's> {
 }
 
 /// Where in a medium a tentative collision is.
+#[expect(
+    clippy::large_enum_variant,
+    reason = "there are a few of them per ray, and a box would be an allocation each"
+)]
 enum Place<'r, 't, 's> {
     /// In a segment of a field, whose distances count from `start`.
     Field {

@@ -11,7 +11,7 @@ use nuage_volume::channel::Channel;
 use crate::camera::Camera;
 use crate::color::Blackbody;
 use crate::light::{Light, Sky, Sun};
-use crate::phase::{hg, sample_hg};
+pub use crate::phase::Phase;
 
 /// A participating medium and where it is.
 #[derive(Debug, Clone)]
@@ -60,42 +60,6 @@ impl<'a> Shape<'a> {
             Shape::Grid(channel) => Some(channel),
             Shape::Box { .. } | Shape::Ball { .. } => None,
         }
-    }
-}
-
-/// How light that scatters spreads over directions.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Phase {
-    /// The function of Henyey and Greenstein.
-    HenyeyGreenstein {
-        /// The mean cosine; positive is forward.
-        g: f32,
-    },
-}
-
-impl Phase {
-    /// Its value [1/sr] at the cosine between the directions of travel before and after.
-    #[inline]
-    pub fn value(&self, cosine: f32) -> f32 {
-        match *self {
-            Phase::HenyeyGreenstein { g } => hg(cosine, g),
-        }
-    }
-
-    /// Its value [1/sr] between two directions of travel of length 1.
-    #[inline]
-    pub fn between(&self, before: Vec3, after: Vec3) -> f32 {
-        self.value(before.dot(after))
-    }
-
-    /// A direction of travel after scattering, distributed as the function itself, and its value there; from two uniform
-    /// numbers.
-    #[inline]
-    pub fn sample(&self, before: Vec3, u: [f32; 2]) -> (Vec3, f32) {
-        let after = match *self {
-            Phase::HenyeyGreenstein { g } => sample_hg(before, g, u),
-        };
-        (after, self.between(before, after))
     }
 }
 

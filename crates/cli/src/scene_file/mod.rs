@@ -18,7 +18,9 @@ use toml::de::DeTable;
 
 use crate::error::Failure;
 use crate::look::{Integrator, Look, not_negative, share, up};
-use crate::plan::{EmissionPlan, Extinction, Given, Glow, LightPlan, Plan, SkyPlan, VolumePlan, What};
+use crate::plan::{
+    EmissionPlan, Extinction, Given, Glow, LightPlan, PhasePlan, Plan, SkyPlan, VolumePlan, What,
+};
 use crate::values::{self, Auto, SunPosition};
 use table::{Table, Wrong};
 pub(crate) use write::save;
@@ -134,7 +136,7 @@ fn parse(text: &str, folder: &Path, look: &Look, given: &Given) -> Result<(Plan,
     }
     let sky = match root.table("sky")? {
         None => SkyPlan::Constant([0.0; 3]),
-        Some(sky) => read_sky(sky)?,
+        Some(sky) => read_sky(sky, folder)?,
     };
     let lights = root.tables("lights")?.into_iter().map(read_light).collect::<Result<_, _>>()?;
     let volumes = root.tables("volumes")?.into_iter();
@@ -159,7 +161,13 @@ fn beside(folder: &Path, file: &str) -> String {
     }
 }
 
-fn read_sky(mut sky: Table<'_, '_>) -> Result<SkyPlan, Wrong> {
+fn read_sky(mut sky: Table<'_, '_>, folder: &Path) -> Result<SkyPlan, Wrong> {
+    if let Some(file) = sky.text("map")? {
+        let turn_degrees = sky.parsed("turn", values::finite)?.unwrap_or(0.0);
+        let scale = sky.parsed("scale", values::positive)?.unwrap_or(1.0);
+        sky.finish()?;
+        return Ok(SkyPlan::Map { file: beside(folder, &file), turn_degrees, scale });
+    }
     let radiance = sky.parsed("radiance", values::rgb)?;
     let gradient = ["zenith", "horizon", "ground"].map(|key| sky.parsed(key, values::rgb));
     let [zenith, horizon, ground] = gradient;
@@ -168,7 +176,7 @@ fn read_sky(mut sky: Table<'_, '_>) -> Result<SkyPlan, Wrong> {
         (None, Some(zenith), Some(horizon), ground) => {
             SkyPlan::Gradient { zenith, horizon, ground: ground.unwrap_or(horizon) }
         }
-        _ => return Err(sky.wrong("a sky has either radiance, or zenith, horizon and ground")),
+        _ => return Err(sky.wrong("a sky has either radiance, or zenith, horizon and ground, or a map")),
     };
     sky.finish()?;
     Ok(plan)
@@ -292,7 +300,22 @@ fn read_volume(mut volume: Table<'_, '_>, folder: &Path, look: &Look) -> Result<
         None => return Err(volume.wrong("a box and a sphere need the key 'extinction'")),
     };
     let albedo = volume.parsed("albedo", values::albedo)?.unwrap_or(look.albedo);
-    let phase = volume.parsed("phase", values::phase)?.unwrap_or(look.phase);
+    let phase = match volume.table_or("phase")? {
+        Some(mut phase) => {
+            let droplets = phase.parsed("droplets", values::positive)?;
+            let g = phase.parsed("g", values::phase)?;
+            let alpha = phase.parsed("alpha", not_negative)?;
+            let plan = match (droplets, g, alpha) {
+                (Some(diameter), None, None) => PhasePlan::Droplets(diameter),
+                (None, Some(g), Some(alpha)) => PhasePlan::Draine([g, alpha]),
+                (None, Some(g), None) => PhasePlan::Lobe(g),
+                _ => return Err(phase.wrong("a phase function has either droplets, or g, or g and alpha")),
+            };
+            phase.finish()?;
+            plan
+        }
+        None => PhasePlan::Lobe(volume.parsed("phase", values::phase)?.unwrap_or(look.phase)),
+    };
     let emission = match volume.table("emission")? {
         None => None,
         Some(emission) => Some(read_emission(emission, look, is_file)?),

@@ -91,6 +91,14 @@ impl<'t, 'i> Table<'t, 'i> {
         }
     }
 
+    /// A table inside, of a key that may hold something else.
+    pub(super) fn table_or(&mut self, key: &'static str) -> Result<Option<Table<'t, 'i>>, Wrong> {
+        let is_table = |(name, value): &(&Spanned<DeString<'i>>, &Spanned<DeValue<'i>>)| {
+            name.get_ref() == key && value.get_ref().is_table()
+        };
+        if self.entries.iter().any(is_table) { self.table(key) } else { Ok(None) }
+    }
+
     /// The tables of an array.
     pub(super) fn tables(&mut self, key: &'static str) -> Result<Vec<Table<'t, 'i>>, Wrong> {
         let Some(value) = self.take(key) else { return Ok(Vec::new()) };

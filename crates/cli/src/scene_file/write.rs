@@ -8,7 +8,7 @@ use glam::{DAffine3, DVec3};
 use nuage_render::light::{Light, Spot};
 
 use super::RunKeys;
-use crate::plan::{EmissionPlan, Extinction, Glow, LightPlan, Plan, SkyPlan, VolumePlan, What};
+use crate::plan::{EmissionPlan, Extinction, Glow, LightPlan, PhasePlan, Plan, SkyPlan, VolumePlan, What};
 use crate::values::{Auto, Background, Size, SunPosition};
 
 /// The text of a scene file that lies in `folder`.
@@ -80,6 +80,11 @@ pub(crate) fn save(plan: &Plan, run: &RunKeys, folder: &Path) -> String {
         "[sky]",
         match sky {
             SkyPlan::Constant(radiance) => vec![("radiance", Some(colour(*radiance)))],
+            SkyPlan::Map { file, turn_degrees, scale } => vec![
+                ("map", Some(quoted(&path(folder, file)))),
+                ("turn", Some(turn_degrees.to_string())),
+                ("scale", Some(scale.to_string())),
+            ],
             SkyPlan::Gradient { zenith, horizon, ground } => vec![
                 ("zenith", Some(colour(*zenith))),
                 ("horizon", Some(colour(*horizon))),
@@ -171,7 +176,14 @@ fn volume_keys(volume: &VolumePlan, folder: &Path) -> Vec<(&'static str, Option<
         }),
     ));
     keys.push(("albedo", Some(colour(volume.albedo))));
-    keys.push(("phase", Some(volume.phase.to_string())));
+    keys.push((
+        "phase",
+        Some(match volume.phase {
+            PhasePlan::Lobe(g) => g.to_string(),
+            PhasePlan::Draine([g, alpha]) => format!("{{ g = {g}, alpha = {alpha} }}"),
+            PhasePlan::Droplets(diameter) => format!("{{ droplets = {diameter} }}"),
+        }),
+    ));
     keys.push((
         "emission",
         volume.emission.as_ref().map(|emission| {
