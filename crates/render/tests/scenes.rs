@@ -168,7 +168,7 @@ fn a_slab_follows_the_closed_form() {
 #[test]
 fn lights_of_one_kind_are_lights_of_another() {
     let density = lumps();
-    for g in [0.0, 0.9] {
+    for (g, paths) in [(0.0, 60), (0.6, 100)] {
         let lit = |light: Light| {
             let mut scene = scene(vec![medium(Shape::Grid(&density), [4.0; 3], g)], vec![light]);
             scene.sky = Sky::Constant([0.0; 3]);
@@ -177,7 +177,7 @@ fn lights_of_one_kind_are_lights_of_another() {
         // A narrow sun is a point.
         let to = Vec3::new(0.0, 0.6, -0.8);
         let sun = |angle_degrees| lit(Light::Sun(Sun { angle_degrees, ..Sun::point(to, [3.0; 3]) }));
-        same("sun", &sun(0.0), &sun(0.3), 60);
+        same("sun", &sun(0.0), &sun(0.3), paths);
         // A sphere far away is a sun.
         let (far, half) = (1e4, 15.0_f64.to_radians());
         let radiance = (3.0 / (std::f64::consts::PI * half.sin().powi(2))) as f32;
@@ -186,7 +186,7 @@ fn lights_of_one_kind_are_lights_of_another() {
             "sphere",
             &sun(30.0),
             &lit(Light::Sphere { centre, radius: far * half.sin(), radiance: [radiance; 3] }),
-            60,
+            paths,
         );
         // A small sphere is a point of the same power, and so is a spot that shines everywhere.
         let (position, radius) = (DVec3::new(0.5, 2.0, -2.5), 0.01);
@@ -197,12 +197,12 @@ fn lights_of_one_kind_are_lights_of_another() {
             "small sphere",
             &point,
             &lit(Light::Sphere { centre: position, radius, radiance: [1e5; 3] }),
-            60,
+            paths,
         );
         let direction = Vec3::X;
         let everywhere =
             Light::Spot(Spot { position, direction, intensity, inner_degrees: 180.0, outer_degrees: 180.0 });
-        same("spot", &point, &lit(everywhere), 60);
+        same("spot", &point, &lit(everywhere), paths);
     }
 }
 
