@@ -568,7 +568,10 @@ fn pass<'s, const COLOURS: usize>(
             if random.unit() * ROULETTE_TRANSMITTANCE >= most {
                 return [0.0; COLOURS];
             }
-            (ratio, known) = (now.map(|passes| passes * (ROULETTE_TRANSMITTANCE / most)), 0.0);
+            // Exactly that for the strongest: a last bit less would ask for the next turn at once.
+            let raised = |passes: f32| passes * (ROULETTE_TRANSMITTANCE / most);
+            ratio = now.map(|passes| if passes < most { raised(passes) } else { ROULETTE_TRANSMITTANCE });
+            known = 0.0;
         }
     }
     passes(&ratio, known)
