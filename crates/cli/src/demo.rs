@@ -114,6 +114,7 @@ fn write(args: &Args, images: &[Image], start: Instant, out: &mut dyn Write) -> 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::plan::Plan;
     use crate::values::Size;
 
     #[test]
@@ -121,7 +122,11 @@ mod tests {
         let mut look = look().unwrap();
         look.size = Size { width: 20, height: 27 };
         look.samples = 1;
-        assert!(!Shot::needs_volumes(&look) && look.camera.is_some() && look.look_at.is_some());
+        assert!(
+            !Plan::of_look(&look, "", None).needs_volumes()
+                && look.camera.is_some()
+                && look.look_at.is_some()
+        );
         let images = render(&look).unwrap();
         let redness = |image: &Image| {
             let [red, _, blue, _] = image.mean();

@@ -3,7 +3,8 @@
 use glam::DVec3;
 
 use crate::values::{
-    Auto, Background, Size, SunPosition, albedo, field_of_view, finite, phase, positive, rgb, vec3,
+    Auto, Background, Size, SunPosition, albedo, field_of_view, finite, of_length_1, phase, positive, rgb,
+    sun_angle, vec3,
 };
 
 /// How light is followed through the medium.
@@ -17,7 +18,7 @@ pub(crate) enum Integrator {
 }
 
 /// View, light, medium and quality.
-#[derive(clap::Args, Clone)]
+#[derive(Debug, clap::Args, Clone)]
 pub(crate) struct Look {
     /// Size of the picture in pixels, WIDTHxHEIGHT
     #[arg(long, default_value = "1024x1024", value_name = "WxH", help_heading = "View")]
@@ -55,6 +56,10 @@ pub(crate) struct Look {
     /// Irradiance of the sun on a surface that faces it, one number or r,g,b (linear Rec.709)
     #[arg(long, default_value = "12,11.2,10", value_parser = rgb, value_name = "E|R,G,B", help_heading = "Light")]
     pub(crate) sun_irradiance: [f32; 3],
+
+    /// Angular diameter of the sun in degrees: 0 is a point, the sun of the earth has 0.53 (with --integrator path)
+    #[arg(long, default_value = "0", value_parser = sun_angle, value_name = "DEGREES", help_heading = "Light")]
+    pub(crate) sun_angle: f32,
 
     /// Radiance of the sky, the same from everywhere, one number or r,g,b (linear Rec.709)
     #[arg(long, default_value = "0.22,0.32,0.5", value_parser = rgb, value_name = "L|R,G,B", help_heading = "Light")]
@@ -137,29 +142,38 @@ pub(crate) struct Look {
     /// Shadow rays towards the sky per camera ray that is scattered whole
     #[arg(long, default_value = "8", value_parser = clap::value_parser!(u32).range(1..=65536), value_name = "N", help_heading = "Quality")]
     pub(crate) sky_rays: u32,
+
+    /// Which random numbers --integrator path takes: pictures of different numbers are independent
+    #[arg(long, default_value = "0", value_name = "N", help_heading = "Quality")]
+    pub(crate) seed: u32,
+
+    /// With --integrator path, see the sky only by paths that leave the volumes, not by rays of their own
+    #[arg(long, help_heading = "Quality")]
+    pub(crate) no_sky_rays: bool,
 }
 
-fn not_negative(text: &str) -> Result<f32, String> {
+/// A number that is not negative.
+pub(crate) fn not_negative(text: &str) -> Result<f32, String> {
     match finite(text)? {
         x if x >= 0.0 => Ok(x),
         _ => Err("a number that is not negative is needed".into()),
     }
 }
 
-fn share(text: &str) -> Result<f32, String> {
+/// A number above 0 and below 1.
+pub(crate) fn share(text: &str) -> Result<f32, String> {
     match positive(text)? {
         share if share < 1.0 => Ok(share),
         _ => Err("a number between 0 and 1 is needed".into()),
     }
 }
 
-fn up(text: &str) -> Result<DVec3, String> {
+/// A direction that is up.
+pub(crate) fn up(text: &str) -> Result<DVec3, String> {
     match text {
         "y" | "Y" => Ok(DVec3::Y),
         "z" | "Z" => Ok(DVec3::Z),
-        _ => vec3(text)
-            .map_err(|e| format!("y, z or a direction is needed: {e}"))?
-            .try_normalize()
+        _ => of_length_1(vec3(text).map_err(|e| format!("y, z or a direction is needed: {e}"))?)
             .ok_or_else(|| "a direction other than 0,0,0 is needed".into()),
     }
 }

@@ -17,10 +17,12 @@ mod info;
 mod json;
 mod look;
 mod pack;
+mod plan;
 mod probe;
 mod progress;
 mod render;
 mod sample;
+mod scene_file;
 mod shot;
 mod source;
 mod text;
@@ -32,9 +34,10 @@ mod verify;
 use std::process::ExitCode;
 
 use clap::error::ErrorKind;
-use clap::{CommandFactory, Parser, Subcommand};
+use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
 use crate::error::Failure;
+use crate::plan::Given;
 
 const AFTER_HELP: &str = "Exit codes: 0 done, 1 failed, 2 wrong usage.";
 
@@ -60,10 +63,15 @@ enum Command {
 }
 
 fn main() -> ExitCode {
-    let outcome = match Cli::parse().command {
+    let matches = Cli::command().get_matches();
+    let command = Cli::from_arg_matches(&matches).unwrap_or_else(|error| error.exit()).command;
+    let outcome = match command {
         Command::Info(args) => info::run(&args),
         Command::Probe(args) => probe::run(&args),
-        Command::Render(args) => render::run(&args),
+        Command::Render(args) => {
+            let given = matches.subcommand_matches("render").map(Given::of).unwrap_or_default();
+            render::run(&args, &given)
+        }
         Command::Demo(args) => demo::run(&args),
         Command::Diff(args) => diff::run(&args),
         Command::Validate(args) => validate::run(&args),

@@ -4,9 +4,10 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
+use glam::DAffine3;
 use nuage_pipeline::import;
 use nuage_pipeline::output::write_whole;
-use nuage_pipeline::sequence::{FrameFile, FrameRange, find_frames, output_path};
+use nuage_pipeline::sequence::{FrameFile, FrameRange, SequenceError, find_frames, output_path};
 use nuage_render::film::Image;
 use nuage_render::framing::WorldBox;
 use nuage_render::output::exr::{ExrPrecision, encode_exr};
@@ -16,7 +17,9 @@ use nuage_volume::channel::IndexBox;
 use crate::error::Failure;
 use crate::frames;
 use crate::look::Look;
+use crate::plan::{Given, Plan, SkyPlan, VolumePlan, What};
 use crate::progress;
+use crate::scene_file::{self, RunKeys};
 use crate::shot::{self, Shot, Volume};
 use crate::source::DiskFile;
 
@@ -31,11 +34,23 @@ const FITTED_FRAMES: usize = 5;
 #[derive(clap::Args)]
 pub(crate) struct Args {
     /// The file or sequence: smoke.vdb, smoke.nuage, smoke.####.vdb, smoke.%04d.vdb, 'smoke.*.vdb' or a folder
-    input: String,
+    #[arg(required_unless_present = "scene")]
+    input: Option<String>,
 
     /// Where to write: .png (sRGB, 8 bit) or .exr (linear); for a sequence with ####, %04d or $F4
-    #[arg(short, long, value_name = "FILE")]
-    output: String,
+    #[arg(short, long, value_name = "FILE", required_unless_present = "scene")]
+    output: Option<String>,
+
+    /// A scene file (TOML) that says what is rendered; options given beside it overrule it
+    ///
+    /// It can hold several volumes, homogeneous ones among them, and more kinds of lights than there are options. A lone
+    /// volume of it is meant by INPUT and by the options of medium and emission.
+    #[arg(long, value_name = "FILE")]
+    scene: Option<PathBuf>,
+
+    /// Write a scene file that says what is rendered, automatic values settled, and then render
+    #[arg(long, value_name = "FILE")]
+    save_scene: Option<PathBuf>,
 
     /// Frames to render, as in 1-100, 1-100x2 or 5,10-20; negative numbers too
     #[arg(long, value_name = "RANGE", allow_hyphen_values = true)]
@@ -71,56 +86,88 @@ pub(crate) struct Args {
 
 /// A frame to be rendered.
 struct Job {
-    input: PathBuf,
+    /// The files of the volumes, in the order of the plan; nothing for those that come from no file.
+    inputs: Vec<Option<PathBuf>>,
     output: PathBuf,
 }
 
-/// Renders.
-pub(crate) fn run(args: &Args) -> Result<(), Failure> {
-    if let Some(threads) = args.threads {
+/// The number of a frame, and the files of its volumes.
+type FrameInputs = (Option<i64>, Vec<Option<PathBuf>>);
+
+/// What the frames of one volume are.
+enum Files {
+    /// It comes from no file.
+    None,
+    /// One file for all frames.
+    One(PathBuf),
+    Sequence(Vec<FrameFile>),
+}
+
+/// Renders. `given` are the options that stand on the command line.
+pub(crate) fn run(args: &Args, given: &Given) -> Result<(), Failure> {
+    let (plan, mut run) = match &args.scene {
+        Some(path) => {
+            let (mut plan, run) = scene_file::read(path, &args.look, given)?;
+            plan.overrule(given, args.input.as_deref(), args.grid.as_deref()).map_err(Failure::Usage)?;
+            (plan, run)
+        }
+        None => {
+            let input = args.input.as_deref().unwrap_or_default();
+            (Plan::of_look(&args.look, input, args.grid.as_deref()), RunKeys::default())
+        }
+    };
+    overrule(&mut run, args);
+    if let Some(threads) = run.threads {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(usize::from(threads)).build_global();
         pool.map_err(|e| Failure::Usage(format!("cannot start {threads} threads: {e}")))?;
     }
-    let frames = &match frames::packed(Path::new(&args.input)) {
-        Some(_) => frames::find(Path::new(&args.input), args.frames.as_ref())?,
-        None => {
-            let sequence =
-                find_frames(&args.input, args.frames.as_ref()).map_err(|e| plain(&args.input, e))?;
-            if !sequence.missing.is_empty() {
-                let missing: Vec<String> = sequence.missing.iter().map(i64::to_string).collect();
-                warn(&args.input, &format!("frames not there: {}", missing.join(", ")));
-            }
-            sequence.frames
-        }
+    let Some(output) = run.output.as_deref() else {
+        return Err(Failure::Usage("the scene names no picture to write: give --output".into()));
     };
+    let frames = find_inputs(&plan, run.frames.as_ref())?;
     let mut jobs = Vec::new();
-    for frame in frames {
-        let output =
-            output_path(&args.output, frame.frame, frames.len() > 1).map_err(|e| plain(&args.output, e))?;
+    for (number, inputs) in &frames {
+        let output = output_path(output, *number, frames.len() > 1).map_err(|e| plain(output, e))?;
         // A name that cannot be encoded is said before anything is rendered.
-        let _ = encoder(&output, args.exr_float)?;
+        let _ = encoder(&output, run.exr_float)?;
         match output.exists() {
-            true if args.resume => {}
-            true if !args.overwrite => {
+            true if run.resume => {}
+            true if !run.overwrite => {
                 let what = "the picture is there already; --overwrite replaces it, --resume leaves it out";
                 return Err(Failure::file(&output, what));
             }
-            _ => jobs.push(Job { input: frame.path.clone(), output }),
+            _ => jobs.push(Job { inputs: inputs.clone(), output }),
         }
     }
-    if jobs.is_empty() {
+    if jobs.is_empty() && args.save_scene.is_none() {
         return Ok(());
     }
-    let (shot, mut loaded) = settle(args, frames)?;
-    if args.timing {
+    // Settled from all frames, whether they are rendered now or were before.
+    let (world_box, mut volumes) = look_at(&plan, &run, &frames)?;
+    let loaded: Vec<Vec<Option<&Volume>>> =
+        volumes.iter().map(|frame| frame.iter().map(Option::as_ref).collect()).collect();
+    let mut shot = Shot::of_plan(plan, world_box, &loaded).map_err(Failure::Usage)?;
+    if let SkyPlan::Map { file, .. } = shot.plan().sky.clone() {
+        let (size, texels) = picture(Path::new(&file))?;
+        shot.light_by(size, texels).map_err(|e| plain(&file, e))?;
+    }
+    if run.timing {
         note(&shot.describe());
     }
+    if let Some(path) = &args.save_scene {
+        let text = scene_file::save(shot.plan(), &run, path.parent().unwrap_or(Path::new("")));
+        write_whole(path, text.as_bytes(), run.overwrite).map_err(|e| plain(path, e))?;
+    }
+    let mut loaded = if frames.len() == 1 { volumes.pop() } else { None };
     let bar = progress::bar(jobs.len());
     let mut failed = false;
     for (i, job) in jobs.iter().enumerate() {
         bar.set_message(job.output.display().to_string());
         let show = |done, total| progress::show(&bar, i, done, total);
-        if let Err(failure) = render_frame(args, &shot, job, loaded.take(), &show) {
+        if let Err(failure) = render_frame(&run, &shot, job, loaded.take(), &show) {
+            if let Failure::Usage(_) = failure {
+                return Err(failure);
+            }
             bar.suspend(|| failure.report());
             failed = true;
         }
@@ -129,25 +176,107 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     if failed { Err(Failure::Reported) } else { Ok(()) }
 }
 
+/// Puts the options over what the scene file says of the run.
+fn overrule(run: &mut RunKeys, args: &Args) {
+    if args.output.is_some() {
+        run.output.clone_from(&args.output);
+    }
+    if args.frames.is_some() {
+        run.frames.clone_from(&args.frames);
+    }
+    if args.overwrite || args.resume {
+        (run.overwrite, run.resume) = (args.overwrite, args.resume);
+    }
+    run.exr_float |= args.exr_float;
+    run.threads = args.threads.or(run.threads);
+    run.timing |= args.timing;
+}
+
+/// The frames to be rendered, each with its number and the files of its volumes.
+fn find_inputs(plan: &Plan, range: Option<&FrameRange>) -> Result<Vec<FrameInputs>, Failure> {
+    let is_alone = plan.volumes.len() == 1;
+    let found = plan.volumes.iter().map(|volume| match &volume.what {
+        What::File { input, .. } => files(input, range, is_alone),
+        What::Box { .. } | What::Sphere { .. } => Ok(Files::None),
+    });
+    let found: Vec<Files> = found.collect::<Result<_, _>>()?;
+    let sequence = found.iter().find_map(|files| match files {
+        Files::Sequence(frames) => Some(frames),
+        Files::None | Files::One(_) => None,
+    });
+    if let (None, Some(_)) = (sequence, range) {
+        return Err(Failure::Usage("--frames is for sequences, and the scene has none".into()));
+    }
+    let numbers: Vec<Option<i64>> = match sequence {
+        Some(frames) => frames.iter().map(|frame| frame.frame).collect(),
+        None => vec![None],
+    };
+    let inputs = |number: Option<i64>| -> Result<Vec<Option<PathBuf>>, Failure> {
+        let input = |(files, volume): (&Files, &VolumePlan)| match files {
+            Files::None => Ok(None),
+            Files::One(path) => Ok(Some(path.clone())),
+            Files::Sequence(frames) => match frames.iter().find(|frame| frame.frame == number) {
+                Some(frame) => Ok(Some(frame.path.clone())),
+                None => {
+                    let What::File { input, .. } = &volume.what else { return Ok(None) };
+                    let number = number.map_or(String::new(), |number| format!(" {number}"));
+                    Err(plain(
+                        input,
+                        format!("frame{number} of another volume is not there; --frames leaves it out"),
+                    ))
+                }
+            },
+        };
+        found.iter().zip(&plan.volumes).map(input).collect()
+    };
+    numbers.into_iter().map(|number| Ok((number, inputs(number)?))).collect()
+}
+
+/// The files of a volume. If it is not the only one, it may be one file where a range of frames is asked for.
+fn files(input: &str, range: Option<&FrameRange>, is_alone: bool) -> Result<Files, Failure> {
+    let as_files = |frames: Vec<FrameFile>| match <[FrameFile; 1]>::try_from(frames) {
+        Ok([FrameFile { frame: None, path }]) => Files::One(path),
+        Ok(frame) => Files::Sequence(frame.into()),
+        Err(frames) => Files::Sequence(frames),
+    };
+    if frames::packed(Path::new(input)).is_some() {
+        return Ok(as_files(frames::find(Path::new(input), range)?));
+    }
+    let found = match find_frames(input, range) {
+        Err(SequenceError::RangeOfOneFile { .. }) if !is_alone => find_frames(input, None),
+        found => found,
+    };
+    let sequence = found.map_err(|e| plain(input, e))?;
+    if !sequence.missing.is_empty() {
+        let missing: Vec<String> = sequence.missing.iter().map(i64::to_string).collect();
+        warn(input, &format!("frames not there: {}", missing.join(", ")));
+    }
+    Ok(as_files(sequence.frames))
+}
+
 fn render_frame(
-    args: &Args,
-    shot: &Shot<'_>,
+    run: &RunKeys,
+    shot: &Shot,
     job: &Job,
-    loaded: Option<Volume>,
+    loaded: Option<Vec<Option<Volume>>>,
     progress: &(dyn Fn(u32, u32) + Sync),
 ) -> Result<(), Failure> {
     let start = Instant::now();
-    let volume = match loaded {
-        Some(volume) => volume,
-        None => load(args, &job.input, true)?,
+    let volumes = match loaded {
+        Some(volumes) => volumes,
+        None => load(shot.plan(), &job.inputs, true)?,
     };
+    let volumes: Vec<Option<&Volume>> = volumes.iter().map(Option::as_ref).collect();
+    if let Some(what) = shot.unsupported(&volumes) {
+        return Err(Failure::Usage(what));
+    }
     let read = start.elapsed();
-    let image = shot.render(&volume, progress).map_err(|e| Failure::Usage(e.to_string()))?;
+    let image = shot.render_frame(&volumes, progress).map_err(|e| Failure::Usage(e.to_string()))?;
     let rendered = start.elapsed();
-    let bytes = encoder(&job.output, args.exr_float)?(&image).map_err(|e| plain(&job.output, e))?;
+    let bytes = encoder(&job.output, run.exr_float)?(&image).map_err(|e| plain(&job.output, e))?;
     // What was there is replaced only if that was asked for when it was found.
-    write_whole(&job.output, &bytes, args.overwrite).map_err(|e| plain(&job.output, e))?;
-    if args.timing {
+    write_whole(&job.output, &bytes, run.overwrite).map_err(|e| plain(&job.output, e))?;
+    if run.timing {
         note(&format!(
             "{}: read {:.0} ms, render {:.0} ms, write {:.0} ms",
             job.output.display(),
@@ -159,48 +288,49 @@ fn render_frame(
     Ok(())
 }
 
-/// Settles what all frames share, whether they are rendered now or were before. Gives the volume of a single
-/// frame along, so that it is not read twice.
-fn settle<'a>(args: &'a Args, frames: &[FrameFile]) -> Result<(Shot<'a>, Option<Volume>), Failure> {
-    let mut volumes = Vec::new();
-    let world_box = if let [frame] = frames {
+/// The volumes of some frames.
+type Volumes = Vec<Vec<Option<Volume>>>;
+
+/// The box of all frames, and the volumes of some of them by which scales are settled. Those of a single frame are always
+/// there, so that they are not read twice.
+fn look_at(
+    plan: &Plan,
+    run: &RunKeys,
+    frames: &[FrameInputs],
+) -> Result<(Option<WorldBox>, Volumes), Failure> {
+    if let [(_, inputs)] = frames {
         let start = Instant::now();
-        let volume = load(args, &frame.path, true)?;
-        if args.timing {
+        let volumes = load(plan, inputs, true)?;
+        if run.timing {
             note(&format!("read {:.0} ms", start.elapsed().as_secs_f64() * 1e3));
         }
-        let boxes = [Some(&volume.density), volume.emission.as_ref()].into_iter().flatten();
-        let world_box = boxes.filter_map(WorldBox::of).reduce(WorldBox::union);
-        volumes.push(volume);
-        world_box
-    } else {
-        let mut union: Option<WorldBox> = None;
-        for frame in frames {
-            match header_box(args, &frame.path) {
-                Ok(Some(world_box)) => union = Some(union.map_or(world_box, |u| u.union(world_box))),
-                Ok(None) => {}
-                // The frame itself is reported when its turn comes.
-                Err(_) => {}
+        let boxes = volumes.iter().flatten().filter_map(Volume::world_box);
+        return Ok((boxes.reduce(WorldBox::union), vec![volumes]));
+    }
+    let mut union: Option<WorldBox> = None;
+    for (_, inputs) in frames {
+        for (volume, path) in plan.volumes.iter().zip(inputs) {
+            // A frame that cannot be read is reported when its turn comes.
+            if let Some(Ok(Some(world_box))) = path.as_ref().map(|path| header_box(volume, path)) {
+                union = Some(union.map_or(world_box, |u| u.union(world_box)));
             }
         }
-        if Shot::needs_volumes(&args.look) {
-            let count = FITTED_FRAMES.min(frames.len());
-            let chosen = (0..count).map(|i| &frames[i * (frames.len() - 1) / (count - 1).max(1)]);
-            volumes.extend(chosen.filter_map(|frame| load(args, &frame.path, false).ok()));
-        }
-        union
-    };
-    let shot = Shot::new(&args.look, world_box, &volumes).map_err(Failure::Usage)?;
-    let loaded = if frames.len() == 1 { volumes.pop() } else { None };
-    Ok((shot, loaded))
+    }
+    let mut volumes = Vec::new();
+    if plan.needs_volumes() {
+        let count = FITTED_FRAMES.min(frames.len());
+        let chosen = (0..count).filter_map(|i| frames.get(i * (frames.len() - 1) / (count - 1).max(1)));
+        volumes.extend(chosen.filter_map(|(_, inputs)| load(plan, inputs, false).ok()));
+    }
+    Ok((union, volumes))
 }
 
-/// The world box of a frame as its header tells it, or if it does not, as its voxels do.
-fn header_box(args: &Args, path: &Path) -> Result<Option<WorldBox>, Failure> {
+/// The world box of a volume as the header of its file tells it, or if that does not, as its voxels do.
+fn header_box(volume: &VolumePlan, path: &Path) -> Result<Option<WorldBox>, Failure> {
     let disk = DiskFile::open(path)?;
     let file = disk.vdb()?;
-    let (density, emission) =
-        shot::choose_grids(&file, args.grid.as_deref(), &args.look).map_err(|e| Failure::file(path, e))?;
+    let (grid, glowing) = names(volume);
+    let (density, emission) = shot::choose_grids(&file, grid, glowing).map_err(|e| Failure::file(path, e))?;
     let mut union: Option<WorldBox> = None;
     for index in [Some(density), emission].into_iter().flatten() {
         let info = &file.grids[index];
@@ -214,21 +344,79 @@ fn header_box(args: &Args, path: &Path) -> Result<Option<WorldBox>, Failure> {
         let Some([min, max]) = bbox else { continue };
         let transform = import::linear_transform(&info.unique_name, &info.transform)
             .map_err(|e| Failure::file(path, e.to_string()))?;
+        let transform = match volume.transform == DAffine3::IDENTITY {
+            true => transform,
+            false => volume.transform * transform,
+        };
         let world_box = WorldBox::of_index_box(&transform, IndexBox { min: min.into(), max: max.into() });
         union = Some(union.map_or(world_box, |u| u.union(world_box)));
     }
     Ok(union)
 }
 
-fn load(args: &Args, path: &Path, warnings: bool) -> Result<Volume, Failure> {
-    let disk = DiskFile::open(path)?;
-    let file = disk.vdb()?;
-    let mut tell = |message: String| {
-        if warnings {
-            warn(&path.display().to_string(), &message);
-        }
+/// The names of the density grid and of the grid that glows.
+fn names(volume: &VolumePlan) -> (Option<&str>, Option<&str>) {
+    let grid = match &volume.what {
+        What::File { grid, .. } => grid.as_deref(),
+        What::Box { .. } | What::Sphere { .. } => None,
     };
-    shot::load(&file, args.grid.as_deref(), &args.look, &mut tell).map_err(|e| Failure::file(path, e))
+    (grid, volume.emission.as_ref().and_then(|emission| emission.grid.as_deref()))
+}
+
+/// Reads the volumes of a frame.
+fn load(plan: &Plan, inputs: &[Option<PathBuf>], warnings: bool) -> Result<Vec<Option<Volume>>, Failure> {
+    let load = |(plan, path): (&VolumePlan, &Option<PathBuf>)| {
+        let Some(path) = path else { return Ok(None) };
+        let disk = DiskFile::open(path)?;
+        let file = disk.vdb()?;
+        let mut tell = |message: String| {
+            if warnings {
+                warn(&path.display().to_string(), &message);
+            }
+        };
+        let (grid, glowing) = names(plan);
+        let mut volume =
+            shot::load_grids(&file, grid, glowing, &mut tell).map_err(|e| Failure::file(path, e))?;
+        volume.transform(&plan.transform);
+        Ok(Some(volume))
+    };
+    plan.volumes.iter().zip(inputs).map(load).collect()
+}
+
+/// The size and the pixels of a picture in OpenEXR.
+fn picture(path: &Path) -> Result<([u32; 2], Vec<[f32; 3]>), Failure> {
+    use exr::prelude::{ReadChannels, ReadLayers};
+    type Pixels = (usize, Vec<[f32; 3]>);
+    // Opened by ourselves: a folder or a pipe is refused, and so is a header that asks for too much.
+    let disk = DiskFile::open_plain(path)?;
+    let bytes =
+        nuage_volume::format::ReadAt::range(&disk, 0, usize::try_from(disk.size()).unwrap_or(usize::MAX));
+    let bytes = bytes.map_err(|e| plain(path, e))?;
+    let meta = exr::meta::MetaData::read_from_buffered(bytes.as_ref(), false).map_err(|e| plain(path, e))?;
+    for header in &meta.headers {
+        let [width, height] = [header.layer_size.width(), header.layer_size.height()];
+        let side = |side: usize| u32::try_from(side).unwrap_or(u32::MAX);
+        nuage_render::film::pixel_count(side(width), side(height)).map_err(|e| plain(path, e))?;
+    }
+    let read = exr::prelude::read()
+        .no_deep_data()
+        .largest_resolution_level()
+        .rgb_channels(
+            |size, _| -> Pixels { (size.width(), vec![[0.0; 3]; size.width() * size.height()]) },
+            |(width, pixels): &mut Pixels, at, (r, g, b): (f32, f32, f32)| {
+                if let Some(pixel) = pixels.get_mut(at.y() * *width + at.x()) {
+                    *pixel = [r, g, b];
+                }
+            },
+        )
+        .first_valid_layer()
+        .all_attributes()
+        .from_buffered(io::Cursor::new(bytes.as_ref()))
+        .map_err(|e| plain(path, e))?;
+    let (width, pixels) = read.layer_data.channel_data.pixels;
+    let height = pixels.len() / width.max(1);
+    let side = |side: usize| u32::try_from(side).unwrap_or(0);
+    Ok(([side(width), side(height)], pixels))
 }
 
 type Encode = Box<dyn Fn(&Image) -> Result<Vec<u8>, nuage_render::output::OutputError>>;

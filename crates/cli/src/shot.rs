@@ -1,24 +1,30 @@
 //! From options and volumes to pictures: what `nuage render` and `nuage demo` share.
 //!
 //! A [`Volume`] is what is loaded of one file; a [`Shot`] is what stays the same over all frames of a sequence:
-//! the camera, and the scales of density and emission. The choices themselves are made by the libraries.
+//! the plan with everything settled that it left open, the camera and the scales of density and emission. The choices
+//! themselves are made by the libraries.
 
-use glam::DVec3;
+use std::sync::Arc;
+
+use glam::{DAffine3, DVec3};
 use nuage_pipeline::import::{self, Report};
 use nuage_pipeline::select;
 use nuage_render::camera::Camera;
 use nuage_render::color::Blackbody;
+use nuage_render::envmap::{self, EnvironmentMap};
 use nuage_render::film::{Image, ImageSizeError};
 use nuage_render::framing::{self, WorldBox};
-use nuage_render::march::Quality;
+use nuage_render::light::{Light, Sky, Sun};
+use nuage_render::march::{self, Quality};
 use nuage_render::path::PathSettings;
 use nuage_render::picture;
-use nuage_render::scene::{Emission, Medium, Scene, Spectrum, Sun};
+use nuage_render::scene::{self, Emission, Phase, Scene, Shape, Spectrum};
 use nuage_vdb::{File, Source};
 use nuage_volume::channel::Channel;
 
 use crate::error::explain;
 use crate::look::{Integrator, Look};
+use crate::plan::{EmissionPlan, Extinction, Glow, LightPlan, PhasePlan, Plan, SkyPlan};
 use crate::values::{Auto, Background, Size};
 
 /// The temperature at which a black body has the stated luminance.
@@ -30,12 +36,34 @@ pub(crate) struct Volume {
     pub(crate) emission: Option<Channel>,
 }
 
+impl Volume {
+    /// Where it is; `None` if it is nowhere.
+    pub(crate) fn world_box(&self) -> Option<WorldBox> {
+        let channels = [Some(&self.density), self.emission.as_ref()].into_iter().flatten();
+        channels.filter_map(WorldBox::of).reduce(WorldBox::union)
+    }
+
+    /// Moves it.
+    pub(crate) fn transform(&mut self, world_from_file: &DAffine3) {
+        if *world_from_file != DAffine3::IDENTITY {
+            for channel in [Some(&mut self.density), self.emission.as_mut()].into_iter().flatten() {
+                channel.world_from_index = *world_from_file * channel.world_from_index;
+            }
+        }
+    }
+}
+
+/// The volumes of a frame, in the order of the plan; of those that come from no file, nothing.
+pub(crate) type Frame<'v> = [Option<&'v Volume>];
+
 /// What the frames of a sequence have in common.
-pub(crate) struct Shot<'l> {
-    look: &'l Look,
+pub(crate) struct Shot {
+    /// Without anything left open.
+    plan: Plan,
     camera: Camera,
-    density_scale: f32,
-    spectrum: Option<Spectrum>,
+    spectra: Vec<Option<Spectrum>>,
+    /// The picture of the sky, if the plan names one.
+    map: Option<Arc<EnvironmentMap>>,
 }
 
 /// The positions in the file of the density grid and of the grid that glows.
@@ -45,13 +73,12 @@ pub(crate) struct Shot<'l> {
 pub(crate) fn choose_grids<S: Source>(
     file: &File<S>,
     grid: Option<&str>,
-    look: &Look,
+    glowing: Option<&str>,
 ) -> Result<(usize, Option<usize>), String> {
     let density = match grid {
         Some(name) => select::named_grid(file, name),
         None => select::density_grid(file),
     };
-    let glowing = look.temperature.as_deref().or(look.flame.as_deref());
     let emission = glowing.map(|name| select::named_grid(file, name)).transpose();
     Ok((density.map_err(|e| e.to_string())?, emission.map_err(|e| e.to_string())?))
 }
@@ -66,7 +93,20 @@ pub(crate) fn load<S: Source>(
     look: &Look,
     warn: &mut dyn FnMut(String),
 ) -> Result<Volume, String> {
-    let (density, emission) = choose_grids(file, grid, look)?;
+    load_grids(file, grid, look.temperature.as_deref().or(look.flame.as_deref()), warn)
+}
+
+/// As [`load`], by the names of the density grid and of the grid that glows.
+///
+/// # Errors
+/// What is wrong, in words.
+pub(crate) fn load_grids<S: Source>(
+    file: &File<S>,
+    grid: Option<&str>,
+    glowing: Option<&str>,
+    warn: &mut dyn FnMut(String),
+) -> Result<Volume, String> {
+    let (density, emission) = choose_grids(file, grid, glowing)?;
     let namesakes = select::namesakes(file, density);
     if namesakes.len() > 1 && grid.is_none_or(|name| name != file.grids[density].unique_name) {
         warn(format!(
@@ -108,44 +148,72 @@ fn messages(name: &str, report: &Report, channel: &Channel) -> Vec<String> {
     .collect()
 }
 
-impl<'l> Shot<'l> {
-    /// Settles camera and scales from the box of all frames and some volumes of the sequence.
+impl Shot {
+    /// Settles camera and scales of one volume from the box of all frames and some volumes of the sequence.
     ///
     /// # Errors
     /// What is wrong with the view, in words.
-    pub(crate) fn new(
-        look: &'l Look,
+    pub(crate) fn new(look: &Look, world_box: Option<WorldBox>, volumes: &[Volume]) -> Result<Self, String> {
+        let frames: Vec<Vec<Option<&Volume>>> = volumes.iter().map(|volume| vec![Some(volume)]).collect();
+        Self::of_plan(Plan::of_look(look, "", None), world_box, &frames)
+    }
+
+    /// Settles what a plan leaves open from the box of all frames and some frames of the sequence.
+    ///
+    /// # Errors
+    /// What is wrong with the view, in words.
+    pub(crate) fn of_plan(
+        mut plan: Plan,
         world_box: Option<WorldBox>,
-        volumes: &[Volume],
+        frames: &[Vec<Option<&Volume>>],
     ) -> Result<Self, String> {
-        let camera = camera(look, world_box)?;
-        let aspect = f64::from(look.size.width) / f64::from(look.size.height);
+        let boxes = plan.volumes.iter().filter_map(|volume| Some(solid_box(volume.solid()?)));
+        let world_box = boxes.chain(world_box).reduce(WorldBox::union);
+        let (camera, target) = camera(&plan.look, world_box)?;
+        (plan.look.camera, plan.look.look_at) = (Some(camera.origin), Some(target));
+        let aspect = f64::from(plan.look.size.width) / f64::from(plan.look.size.height);
         // The smallest scale belongs to the densest frame, which must not become a black slab.
         let smallest = |scales: &mut dyn Iterator<Item = f32>| scales.reduce(f32::min).unwrap_or(1.0);
-        let density_scale = match look.density {
-            Auto::Value(scale) => scale,
-            Auto::Auto => smallest(
-                &mut volumes.iter().filter_map(|v| framing::fit_density_scale(&v.density, &camera, aspect)),
-            ),
-        };
-        let spectrum = spectrum(look).map(|unscaled| {
-            let scale = match look.emission {
+        let mut spectra = Vec::new();
+        for (i, volume) in plan.volumes.iter_mut().enumerate() {
+            let loaded = || frames.iter().filter_map(|frame| frame.get(i).copied().flatten());
+            if volume.extinction == Extinction::Auto {
+                let fitted = |volume: &Volume| framing::fit_density_scale(&volume.density, &camera, aspect);
+                volume.extinction = Extinction::Rgb([smallest(&mut loaded().filter_map(fitted)); 3]);
+            }
+            let Some(EmissionPlan { colour, scale, .. }) = &mut volume.emission else {
+                spectra.push(None);
+                continue;
+            };
+            let unscaled = spectrum(*colour);
+            let value = match *scale {
                 Auto::Value(scale) => scale,
-                Auto::Auto => smallest(&mut volumes.iter().filter_map(|volume| {
-                    let channel = volume.emission.as_ref()?;
-                    let emission = Emission { channel, spectrum: unscaled.clone() };
+                Auto::Auto => smallest(&mut loaded().filter_map(|volume| {
+                    let emission = Emission { channel: volume.emission.as_ref(), spectrum: unscaled.clone() };
                     framing::fit_emission_scale(&emission, &camera, aspect)
                 })),
             };
-            unscaled.brighter(scale)
-        });
-        Ok(Shot { look, camera, density_scale, spectrum })
+            *scale = Auto::Value(value);
+            spectra.push(Some(unscaled.brighter(value)));
+        }
+        Ok(Shot { plan, camera, spectra, map: None })
     }
 
-    /// Whether volumes are looked at to settle what the options leave open.
-    pub(crate) fn needs_volumes(look: &Look) -> bool {
-        let glows = look.temperature.is_some() || look.flame.is_some();
-        look.density == Auto::Auto || (look.emission == Auto::Auto && glows)
+    /// Lights it by a picture of radiance of so many columns and rows, as the plan says.
+    ///
+    /// # Errors
+    /// What is wrong with the picture, in words.
+    pub(crate) fn light_by(
+        &mut self,
+        [width, height]: [u32; 2],
+        mut texels: Vec<[f32; 3]>,
+    ) -> Result<(), String> {
+        let SkyPlan::Map { turn_degrees, scale, .. } = self.plan.sky else { return Ok(()) };
+        texels.iter_mut().flatten().for_each(|light| *light *= scale);
+        let world_from_map = envmap::orientation(self.plan.look.up.as_vec3(), turn_degrees / 360.0);
+        let map = EnvironmentMap::new(width, height, texels, world_from_map).map_err(|e| e.to_string())?;
+        self.map = Some(Arc::new(map));
+        Ok(())
     }
 
     /// The view.
@@ -153,26 +221,85 @@ impl<'l> Shot<'l> {
         self.camera
     }
 
+    /// The plan, with nothing left open.
+    pub(crate) fn plan(&self) -> &Plan {
+        &self.plan
+    }
+
     /// Camera and scales in words, so that the shot can be repeated.
     pub(crate) fn describe(&self) -> String {
         let Camera { origin, forward, .. } = self.camera;
         let target = origin + forward;
-        let glow = match &self.spectrum {
-            None => String::new(),
-            Some(Spectrum::Linear { rgb }) => {
-                format!(", flame radiance {},{},{} per unit", rgb[0], rgb[1], rgb[2])
+        let mut text = format!(
+            "--camera {},{},{} --look-at {},{},{}",
+            origin.x, origin.y, origin.z, target.x, target.y, target.z
+        );
+        for (volume, spectrum) in self.plan.volumes.iter().zip(&self.spectra) {
+            if let Extinction::Rgb([red, green, blue]) = volume.extinction {
+                text += &match red == green && green == blue {
+                    true => format!(" --density {red}"),
+                    false => format!(", extinction {red},{green},{blue}"),
+                };
             }
-            Some(Spectrum::Blackbody { scale, kelvin_per_unit, .. }) => {
-                format!(" --emission {scale} --kelvin {kelvin_per_unit}")
-            }
-        };
-        format!(
-            "--camera {},{},{} --look-at {},{},{} --density {}{glow}",
-            origin.x, origin.y, origin.z, target.x, target.y, target.z, self.density_scale
-        )
+            text += &match spectrum {
+                None => String::new(),
+                Some(Spectrum::Linear { rgb }) => {
+                    format!(", flame radiance {},{},{} per unit", rgb[0], rgb[1], rgb[2])
+                }
+                Some(Spectrum::Blackbody { scale, kelvin_per_unit, .. }) => {
+                    format!(" --emission {scale} --kelvin {kelvin_per_unit}")
+                }
+            };
+        }
+        text
     }
 
-    /// Renders a frame: composited, exposed.
+    /// The scene of a frame. A volume that the frame lacks is left out.
+    fn scene<'v>(&'v self, volumes: &Frame<'v>) -> Scene<'v> {
+        let Plan { look, sky, .. } = &self.plan;
+        let plans = self.plan.volumes.iter().zip(&self.spectra).enumerate();
+        let volumes = plans.filter_map(|(i, (plan, spectrum))| {
+            let loaded = volumes.get(i).copied().flatten();
+            let shape = plan.solid().or_else(|| loaded.map(|volume| Shape::Grid(&volume.density)))?;
+            let extinction = match plan.extinction {
+                Extinction::Rgb(rgb) => rgb,
+                Extinction::Auto => [1.0; 3],
+            };
+            let channel = loaded.and_then(|volume| volume.emission.as_ref());
+            let emission = spectrum.clone().map(|spectrum| Emission { channel, spectrum });
+            let phase = match plan.phase {
+                PhasePlan::Lobe(g) => Phase::HenyeyGreenstein { g },
+                PhasePlan::Draine([g, alpha]) => Phase::Draine { g, alpha },
+                PhasePlan::Droplets(diameter_um) => Phase::mie(diameter_um),
+            };
+            Some(scene::Volume { shape, extinction, albedo: plan.albedo, phase, emission })
+        });
+        let z_up = z_is_up(look);
+        let lights = self.plan.lights.iter().filter_map(|light| match *light {
+            LightPlan::Placed(light) => Some(light),
+            LightPlan::Sun { position, irradiance, angle_degrees } => {
+                Some(Light::Sun(Sun { direction_to: position.direction(z_up)?, irradiance, angle_degrees }))
+            }
+        });
+        let sky = match *sky {
+            SkyPlan::Constant(radiance) => Sky::Constant(radiance),
+            // Without a picture there is no light of it.
+            SkyPlan::Map { .. } => self.map.clone().map_or(Sky::Constant([0.0; 3]), Sky::Map),
+            SkyPlan::Gradient { zenith, horizon, ground } => {
+                Sky::Gradient { up: look.up.as_vec3(), zenith, horizon, ground }
+            }
+        };
+        Scene { camera: self.camera, volumes: volumes.collect(), lights: lights.collect(), sky }
+    }
+
+    /// What the marcher could not follow, in words; `None` if it is not asked, or can.
+    pub(crate) fn unsupported(&self, frame: &Frame<'_>) -> Option<String> {
+        let is_marched = self.plan.look.integrator == Integrator::March;
+        let what = march::unsupported(&self.scene(frame)).filter(|_| is_marched)?;
+        Some(format!("--integrator march cannot render {what}; --integrator path can"))
+    }
+
+    /// Renders a frame of one volume: composited, exposed.
     ///
     /// # Errors
     /// If the picture is too large.
@@ -181,24 +308,27 @@ impl<'l> Shot<'l> {
         volume: &Volume,
         progress: &(dyn Fn(u32, u32) + Sync),
     ) -> Result<Image, ImageSizeError> {
-        let look = self.look;
-        let emission = volume
-            .emission
-            .as_ref()
-            .zip(self.spectrum.clone())
-            .map(|(channel, spectrum)| Emission { channel, spectrum });
-        let medium = Medium {
-            density: &volume.density,
-            density_scale: self.density_scale,
-            albedo: look.albedo,
-            phase_g: look.phase,
-            emission,
-        };
-        let sun = look
-            .sun
-            .direction(z_is_up(look))
-            .map(|direction_to| Sun { direction_to, irradiance: look.sun_irradiance });
-        let scene = Scene { camera: self.camera, medium, sun, sky: look.sky };
+        self.render_scene(&self.scene(&[Some(volume)]), progress)
+    }
+
+    /// Renders a frame: composited, exposed.
+    ///
+    /// # Errors
+    /// If the picture is too large.
+    pub(crate) fn render_frame(
+        &self,
+        frame: &Frame<'_>,
+        progress: &(dyn Fn(u32, u32) + Sync),
+    ) -> Result<Image, ImageSizeError> {
+        self.render_scene(&self.scene(frame), progress)
+    }
+
+    fn render_scene(
+        &self,
+        scene: &Scene<'_>,
+        progress: &(dyn Fn(u32, u32) + Sync),
+    ) -> Result<Image, ImageSizeError> {
+        let look = &self.plan.look;
         let quality = Quality {
             step_voxels: look.step,
             shadow_step_voxels: look.shadow_step,
@@ -210,36 +340,69 @@ impl<'l> Shot<'l> {
         };
         let Size { width, height } = look.size;
         let image = match look.integrator {
-            Integrator::March => picture::render(&scene, quality, width, height, progress)?,
+            Integrator::March => picture::render(scene, quality, width, height, progress)?,
             Integrator::Path => {
-                let settings = PathSettings { max_scatterings: look.scatterings, ..PathSettings::default() };
-                picture::trace(&scene, settings, look.samples, 0, [width, height], progress)?.image
+                let settings =
+                    PathSettings { max_scatterings: look.scatterings, sky_rays: !look.no_sky_rays };
+                picture::trace(scene, settings, look.samples, look.seed, [width, height], progress)?.image
             }
         };
         let image = match look.background {
             Background::None => image,
-            Background::Sky => image.over(look.sky),
+            Background::Sky => before_sky(image, scene),
             Background::Rgb(rgb) => image.over(rgb),
         };
         Ok(if look.exposure == 0.0 { image } else { image.exposed(look.exposure) })
     }
 }
 
+/// A picture with the sky behind what is in it.
+fn before_sky(mut image: Image, scene: &Scene<'_>) -> Image {
+    if let Sky::Constant(radiance) = scene.sky {
+        return image.over(radiance);
+    }
+    let size = [image.width, image.height];
+    for (i, pixel) in (0..).zip(&mut image.pixels) {
+        let sky = scene.sky.behind(&scene.camera, [i % size[0], i / size[0]], size);
+        let passes = 1.0 - pixel[3];
+        pixel.iter_mut().zip(sky).for_each(|(pixel, sky)| *pixel += passes * sky);
+        pixel[3] = 1.0;
+    }
+    image
+}
+
 fn z_is_up(look: &Look) -> bool {
     look.up.z.abs() > look.up.y.abs()
 }
 
-/// The light of the grid that glows, at a scale of 1.
-fn spectrum(look: &Look) -> Option<Spectrum> {
-    if look.temperature.is_some() {
-        let table = Box::new(Blackbody::new(REFERENCE_KELVIN));
-        Some(Spectrum::Blackbody { kelvin_per_unit: look.kelvin, scale: 1.0, table })
-    } else {
-        look.flame.as_ref().map(|_| Spectrum::Linear { rgb: look.flame_color })
+/// The box around a homogeneous shape.
+fn solid_box(shape: Shape<'_>) -> WorldBox {
+    let (world_from_unit, [low, high]) = match shape {
+        Shape::Grid(_) => (DAffine3::IDENTITY, [0.0, 0.0]),
+        Shape::Box { world_from_unit } => (world_from_unit, [0.0, 1.0]),
+        Shape::Ball { world_from_unit } => (world_from_unit, [-1.0, 1.0]),
+    };
+    let corner = |i: i32| {
+        let pick = |bit: i32| if i >> bit & 1 == 0 { low } else { high };
+        world_from_unit.transform_point3(DVec3::new(pick(0), pick(1), pick(2)))
+    };
+    let first = WorldBox { min: corner(0), max: corner(0) };
+    (1..8).map(corner).fold(first, |all, corner| all.union(WorldBox { min: corner, max: corner }))
+}
+
+/// The light of what glows, at a scale of 1.
+fn spectrum(glow: Glow) -> Spectrum {
+    match glow {
+        Glow::Kelvin(kelvin_per_unit) => {
+            let table = Box::new(Blackbody::new(REFERENCE_KELVIN));
+            Spectrum::Blackbody { kelvin_per_unit, scale: 1.0, table }
+        }
+        Glow::Rgb(rgb) => Spectrum::Linear { rgb },
     }
 }
 
-fn camera(look: &Look, world_box: Option<WorldBox>) -> Result<Camera, String> {
+/// The camera, and what it looks at.
+fn camera(look: &Look, world_box: Option<WorldBox>) -> Result<(Camera, DVec3), String> {
     let aspect = f64::from(look.size.width) / f64::from(look.size.height);
     // An empty sequence is still a picture of the background.
     let world_box = world_box.unwrap_or(WorldBox { min: DVec3::splat(-1.0), max: DVec3::splat(1.0) });
@@ -255,7 +418,8 @@ fn camera(look: &Look, world_box: Option<WorldBox>) -> Result<Camera, String> {
             })
         }
     };
-    camera.ok_or_else(|| {
+    let camera = camera.ok_or_else(|| -> String {
         "the view makes no sense: --camera and --look-at must differ, and --up must not lie along the view".into()
-    })
+    })?;
+    Ok((camera, target))
 }

@@ -29,10 +29,42 @@ pub(crate) fn rgb(text: &str) -> Result<[f32; 3], String> {
         [r, g, b] => [*r, *g, *b],
         _ => return Err("one number, or red,green,blue with commas, is needed".into()),
     };
-    match channels.iter().all(|c| *c >= 0.0) {
-        true => Ok(channels.map(|c| c as f32)),
-        false => Err("light cannot be negative".into()),
+    let channels = channels.map(|c| c as f32);
+    match channels.iter().all(|c| *c >= 0.0 && c.is_finite()) {
+        true => Ok(channels),
+        false => Err("a number is needed that is not negative and not above 3e38".into()),
     }
+}
+
+/// `x,y,z` or one number for all three; none is 0.
+pub(crate) fn scale(text: &str) -> Result<DVec3, String> {
+    let scale = match numbers(text)?.as_slice() {
+        [all] => DVec3::splat(*all),
+        [x, y, z] => DVec3::new(*x, *y, *z),
+        _ => return Err("one number or three are needed".into()),
+    };
+    if scale.cmpne(DVec3::ZERO).all() { Ok(scale) } else { Err("a scale of 0 makes a volume flat".into()) }
+}
+
+/// An angular diameter of a sun in degrees.
+pub(crate) fn sun_angle(text: &str) -> Result<f32, String> {
+    match text.trim().parse::<f32>() {
+        Ok(angle) if (0.0..180.0).contains(&angle) => Ok(angle),
+        _ => Err("an angle from 0 to less than 180 degrees is needed".into()),
+    }
+}
+
+/// The full angle of a cone in degrees.
+pub(crate) fn cone(text: &str) -> Result<f32, String> {
+    match text.trim().parse::<f32>() {
+        Ok(angle) if angle > 0.0 && angle <= 360.0 => Ok(angle),
+        _ => Err("an angle above 0 and up to 360 degrees is needed".into()),
+    }
+}
+
+/// A vector at length 1; as it is, if it has that length already, so that what was written is what is read. `None` for 0.
+pub(crate) fn of_length_1(vector: DVec3) -> Option<DVec3> {
+    if (vector.length_squared() - 1.0).abs() < 1e-6 { Some(vector) } else { vector.try_normalize() }
 }
 
 /// Albedo: as [`rgb`], at most 1.
@@ -76,7 +108,7 @@ pub(crate) fn field_of_view(text: &str) -> Result<f64, String> {
     }
 }
 
-/// A picture size, `WIDTHxHEIGHT` or one number for a square.
+/// A picture size, `WIDTHxHEIGHT`, `WIDTH,HEIGHT` or one number for a square.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Size {
     pub(crate) width: u32,
@@ -88,7 +120,7 @@ impl FromStr for Size {
 
     fn from_str(text: &str) -> Result<Self, String> {
         let side = |part: &str| part.trim().parse::<u32>().ok().filter(|n| *n > 0);
-        let (width, height) = text.split_once(['x', 'X']).unwrap_or((text, text));
+        let (width, height) = text.split_once(['x', 'X', ',']).unwrap_or((text, text));
         match (side(width), side(height)) {
             (Some(width), Some(height)) => match nuage_render::film::pixel_count(width, height) {
                 Ok(_) => Ok(Size { width, height }),

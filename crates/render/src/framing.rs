@@ -7,7 +7,7 @@ use nuage_volume::channel::{Channel, IndexBox};
 use crate::camera::{Camera, Ray};
 use crate::color::luminance;
 use crate::march::{Marcher, Quality, Worker};
-use crate::scene::{Emission, Medium, Scene};
+use crate::scene::{Emission, Scene, Shape, Volume};
 
 /// The optical depth that the denser rays through a volume shall have.
 const TARGET_DEPTH: f32 = 8.0;
@@ -93,20 +93,20 @@ pub fn fit_camera(
 /// A density scale that shows the volume: one at which the denser rays of a view have an optical depth
 /// around eight. `None` if no ray meets anything.
 pub fn fit_density_scale(density: &Channel, camera: &Camera, aspect: f64) -> Option<f32> {
-    let medium = Medium { density, density_scale: 1.0, albedo: [0.0; 3], phase_g: 0.0, emission: None };
+    let volume = Volume::absorbing(Shape::Grid(density), 1.0);
     let depth =
-        dense_value(medium, camera, aspect, |marcher, worker, ray| marcher.depth_per_scale(worker, ray));
+        dense_value(volume, camera, aspect, |marcher, worker, ray| marcher.depth_per_scale(worker, ray));
     valid_scale(TARGET_DEPTH / depth?)
 }
 
 /// How many times brighter an emission has to be so that the brighter rays of a view have a luminance around one,
-/// white in a picture. `None` if no ray meets anything that glows.
+/// white in a picture. `None` if no ray meets anything that glows, or if it has
+/// no channel of its own.
 pub fn fit_emission_scale(emission: &Emission<'_>, camera: &Camera, aspect: f64) -> Option<f32> {
     // The glowing channel stands in for the density, of which nothing is seen.
-    let density = emission.channel;
-    let emission = Some(emission.clone());
-    let medium = Medium { density, density_scale: 0.0, albedo: [0.0; 3], phase_g: 0.0, emission };
-    let luminance = dense_value(medium, camera, aspect, |marcher, worker, ray| {
+    let density = Shape::Grid(emission.channel?);
+    let volume = Volume { emission: Some(emission.clone()), ..Volume::absorbing(density, 0.0) };
+    let luminance = dense_value(volume, camera, aspect, |marcher, worker, ray| {
         luminance(marcher.radiance(worker, ray, 0).scattered.to_array())
     });
     valid_scale(TARGET_LUMINANCE / luminance?)
@@ -114,12 +114,12 @@ pub fn fit_emission_scale(emission: &Emission<'_>, camera: &Camera, aspect: f64)
 
 /// The value that nine of ten rays of a view that see anything stay below.
 fn dense_value(
-    medium: Medium<'_>,
+    volume: Volume<'_>,
     camera: &Camera,
     aspect: f64,
     value: impl for<'m> Fn(&Marcher<'m>, &mut Worker<'m>, &Ray) -> f32,
 ) -> Option<f32> {
-    let scene = Scene { camera: *camera, medium, sun: None, sky: [0.0; 3] };
+    let scene = Scene::of_one(*camera, volume, None, [0.0; 3]);
     let quality = Quality { step_voxels: 1.0, ..Quality::default() };
     let marcher = Marcher::new(&scene, quality);
     let mut worker = marcher.worker();

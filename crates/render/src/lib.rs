@@ -1,6 +1,6 @@
 //! The CPU renderer: the reference that every other renderer of the project is held to.
 //!
-//! [`scene`] says what is rendered and [`camera`] from where; [`traverse`] walks rays through the packed tree;
+//! [`scene`] says what is rendered, [`light`] what lights it, and [`camera`] from where; [`traverse`] walks rays through the packed tree;
 //! [`blocks`] keeps
 //! decoded bricks; [`march`] integrates light along them; [`path`] follows it through any number of scatterings;
 //! [`picture`] runs both over all pixels, and [`progressive`] paths in passes, until a picture is good enough;
@@ -22,6 +22,7 @@ pub mod envmap;
 pub mod film;
 pub mod framing;
 pub mod hash;
+pub mod light;
 pub mod march;
 pub mod math;
 pub mod output;
@@ -31,4 +32,5 @@ pub mod picture;
 pub mod progressive;
 pub mod sampler;
 pub mod scene;
+mod solid;
 pub mod traverse;

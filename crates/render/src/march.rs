@@ -12,6 +12,9 @@
 //! centre of scattering, which leaves an error of second order in its length. The sky's rays stand for equal
 //! shares too, in directions drawn from the phase function, so that their mean is right however few they are.
 //!
+//! Only scenes of one grid with a grey extinction, one sun without extent and an even sky are marched; [`unsupported`]
+//! tells what else a scene has.
+//!
 //! What does not live here: pixels, threads, pictures ([`crate::picture`]).
 
 use glam::Vec3;
@@ -20,9 +23,9 @@ use nuage_volume::accessor::Accessor;
 use crate::blocks::Blocks;
 use crate::camera::Ray;
 use crate::hash::{hash_u32, unit_f32};
+use crate::light::{Light, Sky, Sun};
 use crate::math::{exp, one_minus_exp_neg};
-use crate::phase::{hg, sample_hg};
-use crate::scene::{Emission, Scene};
+use crate::scene::{Phase, Scene, Shape, Spectrum, Volume};
 use crate::traverse::{Field, LocalRay, Reader, Run, RunKind, Runs, floor};
 
 /// A lit homogeneous run is cut after this optical depth, …
@@ -80,15 +83,40 @@ pub struct Radiance {
     pub transmittance: f32,
 }
 
+/// What of a scene the marcher cannot follow, in words; `None` if it sees all of it.
+pub fn unsupported(scene: &Scene<'_>) -> Option<&'static str> {
+    let [volume] = scene.volumes.as_slice() else { return Some("more than one volume, or none") };
+    let [red, green, blue] = volume.extinction;
+    match (volume.shape, scene.lights.as_slice()) {
+        (Shape::Box { .. } | Shape::Ball { .. }, _) => Some("a homogeneous box or ball"),
+        _ if red != green || green != blue => Some("an extinction with a colour"),
+        (_, [_, _, ..]) => Some("more than one light"),
+        (_, [Light::Point { .. } | Light::Spot(_) | Light::Sphere { .. }]) => {
+            Some("a light that is not a sun")
+        }
+        (_, [Light::Sun(sun)]) if sun.angle_degrees > 0.0 => Some("a sun with an extent"),
+        _ if !matches!(scene.sky, Sky::Constant(_)) => Some("a sky that is not the same from everywhere"),
+        _ => None,
+    }
+}
+
 /// A scene made ready for marching.
 pub struct Marcher<'s> {
-    scene: &'s Scene<'s>,
+    medium: Medium,
     quality: Quality,
     density: Option<Field<'s>>,
-    emission: Option<(Field<'s>, &'s Emission<'s>)>,
+    emission: Option<(Field<'s>, &'s Spectrum)>,
+    sun: Option<Sun>,
     sky: Option<Vec3>,
     /// The optical depth at which a shadow ray ends.
     max_shadow_depth: f32,
+}
+
+/// What the one volume is made of.
+struct Medium {
+    density_scale: f32,
+    albedo: Vec3,
+    phase: Phase,
 }
 
 /// What one thread needs to march.
@@ -146,15 +174,32 @@ struct Group {
 }
 
 impl<'s> Marcher<'s> {
-    /// Makes a scene ready.
+    /// Makes a scene ready: its first volume that is a grid, in the light of its first sun and of a sky that is everywhere
+    /// as it is straight above. See [`unsupported`].
     pub fn new(scene: &'s Scene<'s>, quality: Quality) -> Self {
-        let emission = scene.medium.emission.as_ref();
-        let sky = Vec3::from_array(scene.sky);
+        let volume = scene.volumes.iter().find(|volume| volume.shape.channel().is_some());
+        let emission = |volume: &'s Volume<'s>| {
+            let emission = volume.emission.as_ref()?;
+            Some((Field::new(emission.channel.or(volume.shape.channel())?)?, &emission.spectrum))
+        };
+        let sky = scene.sky.radiance(Vec3::Y);
+        let medium = volume.map(|volume| Medium {
+            density_scale: volume.extinction[0],
+            albedo: Vec3::from_array(volume.albedo),
+            phase: volume.phase,
+        });
+        let nothing =
+            Medium { density_scale: 0.0, albedo: Vec3::ZERO, phase: Phase::HenyeyGreenstein { g: 0.0 } };
+        let suns = scene.lights.iter().filter_map(|light| match light {
+            Light::Sun(sun) => Some(*sun),
+            _ => None,
+        });
         Marcher {
-            scene,
+            medium: medium.unwrap_or(nothing),
             quality,
-            density: Field::new(scene.medium.density),
-            emission: emission.and_then(|e| Some((Field::new(e.channel)?, e))),
+            density: volume.and_then(|volume| Field::new(volume.shape.channel()?)),
+            emission: volume.and_then(emission),
+            sun: { suns }.next(),
             sky: (sky != Vec3::ZERO && quality.sky_rays > 0).then_some(sky),
             max_shadow_depth: -quality.min_transmittance.clamp(f32::MIN_POSITIVE, 1.0).ln(),
         }
@@ -180,7 +225,7 @@ impl<'s> Marcher<'s> {
 
         let density = density.map(|(field, interval)| (field, field.local(ray, start), span(interval)));
         let emission = emission.map(|(field, e, i)| (field, e, field.local(ray, start), span(i)));
-        let scale = self.scene.medium.density_scale;
+        let scale = self.medium.density_scale;
         let voxels_per_length = [
             density.as_ref().map_or(0.0, |(_, local, _)| local.direction.length()),
             emission.as_ref().map_or(0.0, |(_, _, local, _)| local.direction.length()),
@@ -224,9 +269,9 @@ impl<'s> Marcher<'s> {
                 let emitted = match (emission_kind, &emission, glow.as_mut()) {
                     (None, ..) | (_, None, _) => Vec3::ZERO,
                     (Some(RunKind::Varying), Some((field, e, local, _)), Some(glow)) => {
-                        e.spectrum.radiance(field.sample(glow.blocks, local.at(t)))
+                        e.radiance(field.sample(glow.blocks, local.at(t)))
                     }
-                    (kind, Some((_, e, ..)), _) => e.spectrum.radiance(constant(kind)),
+                    (kind, Some((_, e, ..)), _) => e.radiance(constant(kind)),
                 };
                 let length = t1 - t0;
                 let depth = (value * scale * length).min(f32::MAX);
@@ -314,12 +359,11 @@ impl<'m, 's> Lighting<'m, 's> {
         local: LocalRay,
         random: u32,
     ) -> Self {
-        let medium = &marcher.scene.medium;
-        let albedo = Vec3::from_array(medium.albedo);
+        let Medium { albedo, phase, .. } = marcher.medium;
         let view = ray.direction.as_vec3();
-        let sun = marcher.scene.sun.as_ref().map(|sun| {
+        let sun = marcher.sun.as_ref().map(|sun| {
             // Light travels along −direction_to before and −view after it is scattered.
-            let phase = hg(sun.direction_to.dot(view), medium.phase_g);
+            let phase = phase.between(sun.direction_to, view);
             (Vec3::from_array(sun.irradiance) * albedo * phase, density.directions() * sun.direction_to)
         });
         let rays = marcher.quality.sky_rays.max(1) as f32;
@@ -395,7 +439,7 @@ impl<'m, 's> Lighting<'m, 's> {
         let start = hash_u32(self.random ^ 0x2545_f491);
         let u = [sequence(start, 0xc13f_a9a9), sequence(hash_u32(start), 0x91e1_0da5)];
         self.sky_index += 1;
-        let direction = sample_hg(self.view, self.marcher.scene.medium.phase_g, u);
+        let (direction, _) = self.marcher.medium.phase.sample(self.view, u);
         self.density.directions() * direction
     }
 
@@ -408,7 +452,7 @@ impl<'m, 's> Lighting<'m, 's> {
         let shift = unit_f32(hash_u32(self.random ^ bits));
         let Quality { shadow_step_voxels, shadow_growth, .. } = self.marcher.quality;
         let lattice = Lattice::new(shadow_step_voxels, &ray, shift).growing(shadow_growth);
-        let scale = self.marcher.scene.medium.density_scale;
+        let scale = self.marcher.medium.density_scale;
         let end = self.density.exit(&ray);
         let limit = self.marcher.max_shadow_depth;
         exp(-optical_depth(self.density, shadow, &ray, end, lattice, scale, limit))

@@ -2,30 +2,42 @@
 //!
 //! Where a path collides is found by delta tracking: tentative collisions at the rate of a majorant, each real with the
 //! chance of the extinction there over it (Woodcock et al., "Techniques used in the GEM code", 1965). Majorants are those of
-//! the tree's own regions, so that empty space costs nothing and thin parts little. At each collision the light of
-//! the sun and of the sky is taken with a transmittance by residual ratio tracking (Novák et al., "Residual Ratio Tracking for
-//! Estimating Attenuation in Participating Media", 2014). Paths end by Russian roulette.
+//! the tree's own regions, so that empty space costs nothing and thin parts little. Several volumes have tentative
+//! collisions of their own, and the nearest counts: where volumes overlap, this is a collision with the sum of their
+//! extinctions. Where extinction has a colour, the majorant is that of the strongest colour, and the choice between real
+//! and not is made for all colours at once: with the chance that it has for a path of one colour chosen at random, given the
+//! path so far. Each colour then weighs by its share of that chance, which is the balance heuristic over the colours (Wilkie
+//! et al., "Hero Wavelength Spectral Sampling", 2014; Miller et al., "A null-scattering path integral formulation of light
+//! transport", 2019); no weight can exceed 3.
+//!
+//! At each collision the light of each light and of the sky is taken with a transmittance by residual ratio tracking (Novák
+//! et al., "Residual Ratio Tracking for Estimating Attenuation in Participating Media", 2014). Of a light with extent, a
+//! direction is taken evenly from what is seen of it, or, where the phase function is narrower than the light, from either
+//! with even chances, weighed by the balance heuristic; of a sky that is a picture always from either (Veach, "Robust Monte Carlo Methods for Light Transport Simulation",
+//! 1997). Paths end by Russian roulette.
 //!
 //! What does not live here: pixels, threads, pictures ([`crate::picture`]).
 
-use glam::Vec3;
+use glam::{DVec3, Vec3};
 use nuage_volume::accessor::Accessor;
 
 use crate::blocks::Blocks;
 use crate::camera::Ray;
+use crate::envmap::EnvironmentMap;
 use crate::hash::{hash_u32, unit_f32};
+use crate::light::{Arriving, Light, Sky};
 use crate::math::{exp, ln};
-use crate::phase::{hg, sample_hg};
-use crate::scene::{Emission, Scene};
-use crate::traverse::{Field, Reader};
+use crate::scene::{Phase, Scene, Shape, Spectrum, Volume};
+use crate::solid::Solid;
+use crate::traverse::{Field, LocalRay, Reader, Runs, Segment};
 
 /// How paths are made.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PathSettings {
     /// How often light may scatter before it reaches the camera; as often as it does if `None`.
     pub max_scatterings: Option<u32>,
-    /// Whether each collision looks for the sky with a ray of its own. Else only paths that leave the medium see it. The sun
-    /// can be seen in no other way.
+    /// Whether each collision looks for the sky with a ray of its own. Else only paths that leave the medium see it. The
+    /// other lights can be seen in no other way.
     pub sky_rays: bool,
 }
 
@@ -41,18 +53,63 @@ const ROULETTE_WEIGHT: f32 = 0.25;
 /// A shadow ray through which less passes goes on with a chance of that over it.
 const ROULETTE_TRANSMITTANCE: f32 = 0.1;
 
+/// An extinction per world length through which nothing passes.
+const OPAQUE: f32 = 1e30;
+
 /// A scene made ready for paths.
 pub struct PathTracer<'s> {
     scene: &'s Scene<'s>,
     settings: PathSettings,
-    density: Option<Field<'s>>,
-    emission: Option<(Field<'s>, &'s Emission<'s>)>,
+    media: Vec<Medium<'s>>,
+    glows: Vec<Glow<'s>>,
+}
+
+/// A volume made ready for paths.
+struct Medium<'s> {
+    region: Region<'s>,
+    /// Extinction per density and world length of the strongest colour.
+    scale: f32,
+    /// The extinction of each colour as a share of that.
+    shares: Vec3,
+    is_grey: bool,
+    albedo: Vec3,
+    phase: Phase,
+}
+
+/// What glows, made ready for paths.
+struct Glow<'s> {
+    region: Region<'s>,
+    spectrum: &'s Spectrum,
+}
+
+/// Where something is.
+enum Region<'s> {
+    Field(Box<Field<'s>>),
+    Solid(Solid),
+}
+
+impl<'s> Region<'s> {
+    /// `None` if it is nowhere.
+    fn new(shape: Shape<'s>) -> Option<Self> {
+        match shape {
+            Shape::Grid(channel) => Some(Region::Field(Box::new(Field::new(channel)?))),
+            shape => Solid::new(shape).map(Region::Solid),
+        }
+    }
+
+    fn reader(&self) -> Option<Reader<'s>> {
+        match self {
+            Region::Field(field) => Some(field.reader()),
+            Region::Solid(_) => None,
+        }
+    }
 }
 
 /// What one thread needs to trace paths.
 pub struct PathWorker<'s> {
-    density: Option<Reader<'s>>,
-    emission: Option<Reader<'s>>,
+    /// Of each medium and each glow: solids need none.
+    media: Vec<Option<Reader<'s>>>,
+    glows: Vec<Option<Reader<'s>>>,
 }
 
 /// What one path brings. Means over many paths are what the ray sees.
@@ -103,174 +160,526 @@ impl Random {
     }
 }
 
+/// Where a path collides.
+struct Collision<'t, 's> {
+    /// The distance along the ray.
+    distance: f64,
+    /// With which of the media.
+    medium: &'t Medium<'s>,
+}
+
+/// What a path is worth on its way.
+struct Carried {
+    /// What light is multiplied by.
+    weight: Vec3,
+    /// The share of each colour in the chance of the path, times three: all 1 in a grey medium.
+    colours: Vec3,
+}
+
+impl Carried {
+    fn worth(&self) -> Vec3 {
+        self.weight * self.colours
+    }
+
+    /// Takes one of two turns, `part` for a colour being its chance there. Gives whether it is that one.
+    fn turns(&mut self, part: Vec3, random: &mut Random) -> bool {
+        let taken = self.colours * part;
+        let chance = taken.element_sum() / 3.0;
+        let (is_taken, left, chance) = match random.unit() < chance {
+            true => (true, taken, chance),
+            false => (false, self.colours - taken, 1.0 - chance),
+        };
+        // A turn without chance is not taken, but for rounding.
+        if chance > 0.0 {
+            self.colours = left.max(Vec3::ZERO) / chance;
+        }
+        is_taken
+    }
+}
+
 impl<'s> PathTracer<'s> {
     /// Makes a scene ready.
     pub fn new(scene: &'s Scene<'s>, settings: PathSettings) -> Self {
-        let emission = scene.medium.emission.as_ref();
-        PathTracer {
-            scene,
-            settings,
-            density: Field::new(scene.medium.density).filter(|_| scene.medium.density_scale > 0.0),
-            emission: emission.and_then(|emission| Some((Field::new(emission.channel)?, emission))),
-        }
+        let medium = |volume: &'s Volume<'s>| {
+            let extinction = Vec3::from_array(volume.extinction);
+            let scale = extinction.max_element();
+            let region = Region::new(volume.shape).filter(|_| scale > 0.0)?;
+            let is_grey = extinction == Vec3::splat(scale);
+            let shares = if is_grey { Vec3::ONE } else { extinction / scale };
+            let albedo = Vec3::from_array(volume.albedo);
+            Some(Medium { region, scale, shares, is_grey, albedo, phase: volume.phase })
+        };
+        let glow = |volume: &'s Volume<'s>| {
+            let emission = volume.emission.as_ref()?;
+            let region = Region::new(emission.channel.map_or(volume.shape, Shape::Grid))?;
+            Some(Glow { region, spectrum: &emission.spectrum })
+        };
+        let media = scene.volumes.iter().filter_map(medium).collect();
+        let glows = scene.volumes.iter().filter_map(glow).collect();
+        PathTracer { scene, settings, media, glows }
     }
 
     /// What a thread needs.
     pub fn worker(&self) -> PathWorker<'s> {
         PathWorker {
-            density: self.density.as_ref().map(Field::reader),
-            emission: self.emission.as_ref().map(|(field, _)| field.reader()),
+            media: self.media.iter().map(|medium| medium.region.reader()).collect(),
+            glows: self.glows.iter().map(|glow| glow.region.reader()).collect(),
         }
     }
 
     /// What one path says of the light along a ray.
     pub fn sample(&self, worker: &mut PathWorker<'s>, ray: &Ray, seed: u32) -> PathSample {
-        let Scene { medium, sun, sky, .. } = self.scene;
-        let (albedo, g) = (Vec3::from_array(medium.albedo), medium.phase_g);
-        let sky = Vec3::from_array(*sky);
+        let Scene { lights, sky, .. } = self.scene;
+        let sky_is_black = sky.is_black();
         let mut random = Random { path: seed, count: 0 };
-        let (mut weight, mut sample) = (Vec3::ONE, PathSample::default());
+        let mut carried = Carried { weight: Vec3::ONE, colours: Vec3::ONE };
+        let mut sample = PathSample::default();
         let mut ray = *ray;
         let mut scatterings = 0;
         loop {
-            let collision = self.fly(worker, &ray, &mut random);
-            let emitted =
-                weight * self.emitted(worker, &ray, collision.unwrap_or(f64::INFINITY), &mut random);
-            *(if scatterings == 0 { &mut sample.emission } else { &mut sample.indirect }) += emitted;
-            let Some(distance) = collision else {
+            let emitted = if scatterings == 0 { &mut sample.emission } else { &mut sample.indirect };
+            let collision = self.fly(worker, &ray, &mut carried, emitted, &mut random);
+            let Some(Collision { distance, medium }) = collision else {
                 match scatterings {
                     0 => sample.passed = true,
                     _ if self.settings.sky_rays => {}
-                    1 => sample.direct += weight * sky,
-                    _ => sample.indirect += weight * sky,
+                    _ => {
+                        let light = carried.worth() * sky.radiance(ray.direction.as_vec3());
+                        *(if scatterings == 1 { &mut sample.direct } else { &mut sample.indirect }) += light;
+                    }
                 }
                 break;
             };
             if scatterings == 0 {
-                (sample.depth, sample.albedo) = (distance as f32, albedo);
+                (sample.depth, sample.albedo) = (distance as f32, medium.albedo);
             }
             if self.settings.max_scatterings.is_some_and(|most| scatterings >= most) {
                 break;
             }
-            weight *= albedo;
+            carried.weight *= medium.albedo;
             scatterings += 1;
-            let chance = weight.max_element() / ROULETTE_WEIGHT;
+            let chance = carried.worth().max_element() / ROULETTE_WEIGHT;
             if chance < 1.0 {
                 if random.unit() >= chance {
                     break;
                 }
-                weight /= chance;
+                carried.weight /= chance;
             }
             let origin = ray.origin + ray.direction * distance;
             let before = ray.direction.as_vec3();
             let mut light = Vec3::ZERO;
-            if let Some(sun) = sun {
-                let towards = Ray { origin, direction: sun.direction_to.as_dvec3() };
-                let phase = hg(before.dot(sun.direction_to), g);
-                let passes = self.transmittance(worker, &towards, &mut random);
-                light += Vec3::from_array(sun.irradiance) * (phase * passes);
+            for source in lights {
+                light += self.arriving(worker, source, origin, before, medium.phase, &mut random);
             }
             let scattered = |random: &mut Random| {
-                let direction = sample_hg(before, g, [random.unit(), random.unit()]).as_dvec3();
-                Ray { origin, direction: direction.normalize() }
+                let (direction, _) = medium.phase.sample(before, [random.unit(), random.unit()]);
+                Ray { origin, direction: direction.as_dvec3().normalize() }
             };
-            if self.settings.sky_rays && sky != Vec3::ZERO {
-                let towards = scattered(&mut random);
-                light += sky * self.transmittance(worker, &towards, &mut random);
+            if self.settings.sky_rays && !sky_is_black {
+                light += match sky {
+                    Sky::Map(map) => self.mapped(worker, map, origin, before, medium.phase, &mut random),
+                    Sky::Constant(_) | Sky::Gradient { .. } => {
+                        let towards = scattered(&mut random);
+                        let radiance = sky.radiance(towards.direction.as_vec3());
+                        radiance * self.transmittance(worker, &towards, f64::INFINITY, &mut random)
+                    }
+                };
             }
-            *(if scatterings == 1 { &mut sample.direct } else { &mut sample.indirect }) += weight * light;
+            let light = carried.worth() * light;
+            *(if scatterings == 1 { &mut sample.direct } else { &mut sample.indirect }) += light;
             ray = scattered(&mut random);
         }
         sample
     }
 
-    /// The distance at which a ray collides, by delta tracking. `None` if it leaves the medium.
-    fn fly(&self, worker: &mut PathWorker<'s>, ray: &Ray, random: &mut Random) -> Option<f64> {
-        let (field, reader) = (self.density.as_ref()?, worker.density.as_mut()?);
-        let Reader { walker, blocks, .. } = reader;
-        let [start, end] = field.interval(ray)?;
-        let local = field.local(ray, start);
-        let mut segments = field.runs(walker, local, 0.0, (end - start) as f32);
-        let mut depth = random.depth();
-        while let Some(segment) = segments.next_segment() {
-            let majorant = segment.max * self.scene.medium.density_scale;
-            let mut t = segment.t0;
-            loop {
-                let left = (segment.t1 - t) * majorant;
-                if depth >= left {
-                    depth -= left;
-                    break;
+    /// The light of a light that a point scatters along `before`, over the share of light that it scatters at all.
+    fn arriving(
+        &self,
+        worker: &mut PathWorker<'s>,
+        light: &Light,
+        at: DVec3,
+        before: Vec3,
+        phase: Phase,
+        random: &mut Random,
+    ) -> Vec3 {
+        match light.arriving(at) {
+            Arriving::Nothing => Vec3::ZERO,
+            Arriving::Ray { direction, distance, irradiance } => {
+                let scatters = phase.between(before, direction.as_vec3());
+                let towards = Ray { origin: at, direction };
+                irradiance * (scatters * self.transmittance(worker, &towards, distance, random))
+            }
+            Arriving::Cone { cone, radiance } => {
+                let solid_angle = cone.solid_angle();
+                // Where the phase function has a peak narrower than the light, that is looked for as well.
+                let peak = phase.value(1.0).max(phase.value(-1.0));
+                let is_narrower = peak * solid_angle > 1.0;
+                let takes_phase = is_narrower && random.unit() < 0.5;
+                let u = [random.unit(), random.unit()];
+                let direction = if takes_phase { phase.sample(before, u).0 } else { cone.sample(u) };
+                if takes_phase && !cone.contains(direction) {
+                    return Vec3::ZERO;
                 }
-                t += depth / majorant;
-                let is_real = segment.min == segment.max
-                    || random.unit() * segment.max < field.sample(blocks, local.at(t));
-                if is_real {
-                    return Some(start + f64::from(t));
-                }
-                depth = random.depth();
+                let scatters = phase.between(before, direction);
+                let density = 1.0 / solid_angle;
+                let density = if is_narrower { 0.5 * (scatters + density) } else { density };
+                let direction = direction.as_dvec3().normalize();
+                let towards = Ray { origin: at, direction };
+                let distance = light.distance(at, direction);
+                radiance * (scatters / density * self.transmittance(worker, &towards, distance, random))
             }
         }
-        None
     }
 
-    /// A number whose mean is the share of light that passes along a ray, by residual ratio tracking: what the least
-    /// extinction of a segment takes away is known, only the rest is left to chance.
-    fn transmittance(&self, worker: &mut PathWorker<'s>, ray: &Ray, random: &mut Random) -> f32 {
-        let (Some(field), Some(reader)) = (&self.density, &mut worker.density) else { return 1.0 };
-        let Some([start, end]) = field.interval(ray) else { return 1.0 };
-        let Reader { shadow_walker, blocks, .. } = reader;
-        let (walker, blocks): (&mut Accessor<'s>, &mut Blocks<'s>) = (shadow_walker, blocks);
-        let scale = self.scene.medium.density_scale;
-        let local = field.local(ray, start);
-        let mut segments = field.runs(walker, local, 0.0, (end - start) as f32);
-        // What passes is `ratio × e^-known`; the exponential is taken where it is wanted.
-        let (mut ratio, mut known, mut depth) = (1.0_f32, 0.0_f32, random.depth());
-        while let Some(segment) = segments.next_segment() {
-            let residual = segment.max - segment.min;
-            known += segment.min * scale * (segment.t1 - segment.t0);
-            let mut t = segment.t0;
-            loop {
-                let left = (segment.t1 - t) * residual * scale;
-                if depth >= left {
-                    depth -= left;
-                    break;
-                }
-                t += depth / (residual * scale);
-                let density = field.sample(blocks, local.at(t));
-                ratio *= (1.0 - (density - segment.min) / residual).max(0.0);
-                depth = random.depth();
-            }
-            let passes = ratio * exp(-known);
-            if passes < ROULETTE_TRANSMITTANCE {
-                if random.unit() * ROULETTE_TRANSMITTANCE >= passes {
-                    return 0.0;
-                }
-                (ratio, known) = (ROULETTE_TRANSMITTANCE, 0.0);
-            }
-        }
-        ratio * exp(-known)
-    }
-
-    /// What the medium emits along a ray up to a distance. As a path gets beyond a point with the chance of the transmittance up to
-    /// there, its mean over paths is weighed by that.
-    fn emitted(&self, worker: &mut PathWorker<'s>, ray: &Ray, distance: f64, random: &mut Random) -> Vec3 {
-        let (Some((field, emission)), Some(reader)) = (&self.emission, &mut worker.emission) else {
-            return Vec3::ZERO;
+    /// The light of a picture of the surroundings that a point scatters along `before`, over the share of light that it
+    /// scatters at all: from a direction that the picture or the phase function chose.
+    fn mapped(
+        &self,
+        worker: &mut PathWorker<'s>,
+        map: &EnvironmentMap,
+        origin: DVec3,
+        before: Vec3,
+        phase: Phase,
+        random: &mut Random,
+    ) -> Vec3 {
+        let takes_map = random.unit() < 0.5;
+        let u = [random.unit(), random.unit()];
+        let direction = match takes_map {
+            true => map.sample(u).map(|sample| sample.direction),
+            false => Some(phase.sample(before, u).0),
         };
-        let Some([start, end]) = field.interval(ray) else { return Vec3::ZERO };
-        let Reader { walker, blocks, .. } = reader;
-        let local = field.local(ray, start);
-        let length = (end.min(distance) - start) as f32;
-        if length <= 0.0 {
-            return Vec3::ZERO;
+        let Some(direction) = direction else { return Vec3::ZERO };
+        let scatters = phase.between(before, direction);
+        let density = 0.5 * (scatters + map.pdf(direction));
+        let towards = Ray { origin, direction: direction.as_dvec3().normalize() };
+        let passes = self.transmittance(worker, &towards, f64::INFINITY, random);
+        if density > 0.0 { map.radiance(direction) * (scatters / density) * passes } else { Vec3::ZERO }
+    }
+
+    /// Where a ray collides, by delta tracking; `None` if it leaves all media. What they emit on the way is added to
+    /// `emitted`.
+    fn fly<'t>(
+        &'t self,
+        worker: &mut PathWorker<'s>,
+        ray: &Ray,
+        carried: &mut Carried,
+        emitted: &mut Vec3,
+        random: &mut Random,
+    ) -> Option<Collision<'t, 's>> {
+        let PathWorker { media, glows } = worker;
+        let (collision, told) = match (self.media.as_slice(), media.as_mut_slice()) {
+            ([medium @ Medium { region: Region::Field(field), is_grey: true, .. }], [Some(reader)]) => {
+                let distance = fly_alone(field, reader, medium.scale, ray, random);
+                (distance.map(|distance| Collision { distance, medium }), 0.0)
+            }
+            _ => self.fly_among(media, glows, ray, carried, emitted, random),
+        };
+        let end = collision.as_ref().map_or(f64::INFINITY, |collision| collision.distance);
+        if !self.glows.is_empty() {
+            *emitted += carried.worth() * self.emitted(glows, ray, [told, end], random);
         }
-        let mut segments = field.runs(walker, local, 0.0, length);
+        collision
+    }
+
+    /// As [`fly`](Self::fly), among any media; gives also how far emission has been counted.
+    fn fly_among<'t>(
+        &'t self,
+        readers: &mut [Option<Reader<'s>>],
+        glows: &mut [Option<Reader<'s>>],
+        ray: &Ray,
+        carried: &mut Carried,
+        emitted: &mut Vec3,
+        random: &mut Random,
+    ) -> (Option<Collision<'t, 's>>, f64) {
+        let mut told = 0.0;
+        let media = self.media.iter().zip(readers);
+        let mut fronts: Vec<Front<'_, 't, 's>> = media
+            .filter_map(|(medium, reader)| Front::new(medium, reader.as_mut(), ray, carried.colours, random))
+            .collect();
+        loop {
+            let nearest = fronts.iter_mut().min_by(|a, b| a.next.total_cmp(&b.next));
+            let Some(front) = nearest.filter(|front| front.next < f64::INFINITY) else { return (None, told) };
+            let distance = front.next;
+            let part = front.density_over_majorant();
+            let is_real = if front.medium.is_grey {
+                part >= 1.0 || random.unit() < part
+            } else {
+                // What is emitted up to here is worth what the path was worth up to here.
+                if !self.glows.is_empty() {
+                    *emitted += carried.worth() * self.emitted(glows, ray, [told, distance], random);
+                    told = distance;
+                }
+                carried.turns((front.medium.shares * (part / front.live)).min(Vec3::ONE), random)
+            };
+            if is_real {
+                return (Some(Collision { distance, medium: front.medium }), told);
+            }
+            front.advance(carried.colours, random);
+        }
+    }
+
+    /// A vector whose mean is the share of light that passes along a ray up to a distance.
+    fn transmittance(&self, worker: &mut PathWorker<'s>, ray: &Ray, limit: f64, random: &mut Random) -> Vec3 {
+        let mut passes = Vec3::ONE;
+        for (medium, reader) in self.media.iter().zip(&mut worker.media) {
+            passes *= match (&medium.region, reader) {
+                (Region::Field(field), Some(reader)) if medium.is_grey => {
+                    let [passes] = pass(field, reader, medium.scale, [1.0], ray, limit, random);
+                    Vec3::splat(passes)
+                }
+                (Region::Field(field), Some(reader)) => {
+                    let shares = medium.shares.to_array();
+                    Vec3::from_array(pass(field, reader, medium.scale, shares, ray, limit, random))
+                }
+                (Region::Solid(solid), _) => match solid.interval(ray) {
+                    Some([start, end]) => {
+                        let depth = (medium.scale * (end.min(limit) - start).max(0.0) as f32).min(f32::MAX);
+                        (medium.shares * depth).map(|depth| exp(-depth))
+                    }
+                    None => Vec3::ONE,
+                },
+                (Region::Field(_), None) => Vec3::ONE,
+            };
+            if passes == Vec3::ZERO {
+                break;
+            }
+        }
+        passes
+    }
+
+    /// What the media emit along a stretch of a ray. As a path gets beyond a point with the chance of the transmittance up
+    /// to there, its mean over paths is weighed by that.
+    fn emitted(
+        &self,
+        readers: &mut [Option<Reader<'s>>],
+        ray: &Ray,
+        [from, to]: [f64; 2],
+        random: &mut Random,
+    ) -> Vec3 {
         let mut light = Vec3::ZERO;
-        while let Some(segment) = segments.next_segment() {
-            let length = segment.t1 - segment.t0;
-            let t = segment.t0 + random.unit() * length;
-            light += emission.spectrum.radiance(field.sample(blocks, local.at(t))) * length;
+        for (glow, reader) in self.glows.iter().zip(readers) {
+            let cut = |[start, end]: [f64; 2]| [start.max(from), end.min(to)];
+            match (&glow.region, reader) {
+                (Region::Field(field), Some(reader)) => {
+                    let Some([start, end]) = field.interval(ray).map(cut) else { continue };
+                    let length = (end - start) as f32;
+                    if length <= 0.0 {
+                        continue;
+                    }
+                    let Reader { walker, blocks, .. } = reader;
+                    let local = field.local(ray, start);
+                    let mut segments = field.runs(walker, local, 0.0, length);
+                    while let Some(segment) = segments.next_segment() {
+                        let length = segment.t1 - segment.t0;
+                        let t = segment.t0 + random.unit() * length;
+                        light += glow.spectrum.radiance(field.sample(blocks, local.at(t))) * length;
+                    }
+                }
+                (Region::Solid(solid), _) => {
+                    let length = solid.interval(ray).map(cut).map_or(0.0, |[start, end]| end - start);
+                    light += glow.spectrum.radiance(1.0) * length.max(0.0) as f32;
+                }
+                (Region::Field(_), None) => {}
+            }
         }
         light
+    }
+}
+
+/// The distance at which a ray collides in the one grey medium that there is.
+fn fly_alone<'s>(
+    field: &Field<'s>,
+    reader: &mut Reader<'s>,
+    scale: f32,
+    ray: &Ray,
+    random: &mut Random,
+) -> Option<f64> {
+    let Reader { walker, blocks, .. } = reader;
+    let [start, end] = field.interval(ray)?;
+    let local = field.local(ray, start);
+    let mut segments = field.runs(walker, local, 0.0, (end - start) as f32);
+    let mut depth = random.depth();
+    while let Some(segment) = segments.next_segment() {
+        let majorant = segment.max * scale;
+        let mut t = segment.t0;
+        loop {
+            let left = (segment.t1 - t) * majorant;
+            if depth >= left {
+                depth -= left;
+                break;
+            }
+            t += depth / majorant;
+            let is_real =
+                segment.min == segment.max || random.unit() * segment.max < field.sample(blocks, local.at(t));
+            if is_real {
+                return Some(start + f64::from(t));
+            }
+            depth = random.depth();
+        }
+    }
+    None
+}
+
+/// A number whose mean is the share of light that passes along a ray through a field up to a distance, for each of some
+/// colours, whose extinctions are `shares` of `scale`. By residual ratio tracking: what the least extinction of a segment
+/// takes away is known, only the rest is left to chance.
+fn pass<'s, const COLOURS: usize>(
+    field: &Field<'s>,
+    reader: &mut Reader<'s>,
+    scale: f32,
+    shares: [f32; COLOURS],
+    ray: &Ray,
+    limit: f64,
+    random: &mut Random,
+) -> [f32; COLOURS] {
+    let Some([start, end]) = field.interval(ray) else { return [1.0; COLOURS] };
+    let Reader { shadow_walker, blocks, .. } = reader;
+    let (walker, blocks): (&mut Accessor<'s>, &mut Blocks<'s>) = (shadow_walker, blocks);
+    let local = field.local(ray, start);
+    let mut segments = field.runs(walker, local, 0.0, (end.min(limit) - start) as f32);
+    // What passes is `ratio × e^-known`; the exponential is taken where it is wanted.
+    let (mut ratio, mut known, mut depth) = ([1.0_f32; COLOURS], 0.0_f32, random.depth());
+    let passes = |ratio: &[f32; COLOURS], known: f32| -> [f32; COLOURS] {
+        std::array::from_fn(|i| ratio[i] * exp(-known.min(f32::MAX) * shares[i]))
+    };
+    while let Some(segment) = segments.next_segment() {
+        let residual = segment.max - segment.min;
+        if residual * scale > OPAQUE {
+            return [0.0; COLOURS];
+        }
+        known += segment.min * scale * (segment.t1 - segment.t0);
+        let mut t = segment.t0;
+        loop {
+            let left = (segment.t1 - t) * residual * scale;
+            if depth >= left {
+                depth -= left;
+                break;
+            }
+            t += depth / (residual * scale);
+            let part = (field.sample(blocks, local.at(t)) - segment.min) / residual;
+            for (ratio, share) in ratio.iter_mut().zip(shares) {
+                *ratio *= (1.0 - part * share).max(0.0);
+            }
+            depth = random.depth();
+        }
+        let now = passes(&ratio, known);
+        let most = now.iter().copied().fold(0.0, f32::max);
+        if most < ROULETTE_TRANSMITTANCE {
+            if random.unit() * ROULETTE_TRANSMITTANCE >= most {
+                return [0.0; COLOURS];
+            }
+            // Exactly that for the strongest: a last bit less would ask for the next turn at once.
+            let raised = |passes: f32| passes * (ROULETTE_TRANSMITTANCE / most);
+            ratio = now.map(|passes| if passes < most { raised(passes) } else { ROULETTE_TRANSMITTANCE });
+            known = 0.0;
+        }
+    }
+    passes(&ratio, known)
+}
+
+/// The next tentative collision of a ray with one medium.
+struct Front<'r, 't, 's> {
+    medium: &'t Medium<'s>,
+    /// Its distance along the ray; infinite if there is none.
+    next: f64,
+    /// Of the strongest colour's extinction, the share of which it was made.
+    live: f32,
+    place: Place<'r, 't, 's>,
+}
+
+/// Where in a medium a tentative collision is.
+#[expect(
+    clippy::large_enum_variant,
+    reason = "there are a few of them per ray, and a box would be an allocation each"
+)]
+enum Place<'r, 't, 's> {
+    /// In a segment of a field, whose distances count from `start`.
+    Field {
+        field: &'t Field<'s>,
+        blocks: &'r mut Blocks<'s>,
+        local: LocalRay,
+        start: f64,
+        segments: Runs<'r, 's>,
+        segment: Segment,
+        t: f32,
+    },
+    /// Before the end of a solid.
+    Solid { end: f64 },
+}
+
+impl<'r, 't, 's> Front<'r, 't, 's> {
+    /// The first tentative collision; `None` if the ray misses the medium.
+    fn new(
+        medium: &'t Medium<'s>,
+        reader: Option<&'r mut Reader<'s>>,
+        ray: &Ray,
+        colours: Vec3,
+        random: &mut Random,
+    ) -> Option<Self> {
+        let (next, place) = match (&medium.region, reader) {
+            (Region::Field(field), Some(reader)) => {
+                let Reader { walker, blocks, .. } = reader;
+                let [start, end] = field.interval(ray)?;
+                let local = field.local(ray, start);
+                let mut segments = field.runs(walker, local, 0.0, (end - start) as f32);
+                let segment = segments.next_segment()?;
+                (start, Place::Field { field, blocks, local, start, segments, segment, t: segment.t0 })
+            }
+            (Region::Solid(solid), _) => {
+                let [start, end] = solid.interval(ray)?;
+                (start, Place::Solid { end })
+            }
+            (Region::Field(_), None) => return None,
+        };
+        let mut front = Front { medium, next, live: 1.0, place };
+        front.advance(colours, random);
+        Some(front)
+    }
+
+    /// Moves on to the next tentative collision. A colour that the path has no share of needs no majorant.
+    fn advance(&mut self, colours: Vec3, random: &mut Random) {
+        if !self.medium.is_grey {
+            self.live = Vec3::select(colours.cmpgt(Vec3::ZERO), self.medium.shares, Vec3::ZERO).max_element();
+        }
+        let scale = self.medium.scale * self.live;
+        if scale <= 0.0 {
+            self.next = f64::INFINITY;
+            return;
+        }
+        let mut depth = random.depth();
+        self.next = match &mut self.place {
+            Place::Solid { end } => {
+                let next = self.next + f64::from(depth / scale);
+                if next < *end { next } else { f64::INFINITY }
+            }
+            Place::Field { start, segments, segment, t, .. } => loop {
+                let majorant = segment.max * scale;
+                let left = (segment.t1 - *t) * majorant;
+                if depth < left {
+                    *t += depth / majorant;
+                    break *start + f64::from(*t);
+                }
+                depth -= left;
+                match segments.next_segment() {
+                    Some(next) => (*segment, *t) = (next, next.t0),
+                    None => break f64::INFINITY,
+                }
+            },
+        };
+    }
+
+    /// The density at the tentative collision as a share of the majorant.
+    fn density_over_majorant(&mut self) -> f32 {
+        match &mut self.place {
+            Place::Solid { .. } => 1.0,
+            Place::Field { segment, .. }
+                if segment.min == segment.max || segment.max * self.medium.scale * self.live > OPAQUE =>
+            {
+                1.0
+            }
+            Place::Field { field, blocks, local, segment, t, .. } => {
+                (field.sample(blocks, local.at(*t)) / segment.max).min(1.0)
+            }
+        }
     }
 }

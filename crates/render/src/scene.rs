@@ -1,34 +1,74 @@
-//! What is rendered: a medium, its lights and a camera. Plain data, shared by all renderers.
+//! What is rendered: volumes, lights, a sky and a camera. Plain data, shared by all renderers.
 //!
-//! Light is scene-linear Rec.709. Extinction σt = density × `density_scale`, in 1/world length; scattering
-//! σs = albedo × σt.
+//! Light is scene-linear Rec.709. Extinction σt = density × `extinction`, in 1/world length; scattering
+//! σs = albedo × σt. Where volumes overlap, their extinctions add up, and each scatters its share in its own way.
+//!
+//! What does not live here: lights ([`crate::light`]), and how any of this is followed ([`crate::march`], [`crate::path`]).
 
-use glam::Vec3;
+use glam::{DAffine3, Vec3};
 use nuage_volume::channel::Channel;
 
 use crate::camera::Camera;
 use crate::color::Blackbody;
+use crate::light::{Light, Sky, Sun};
+pub use crate::phase::Phase;
 
-/// A participating medium.
+/// A participating medium and where it is.
 #[derive(Debug, Clone)]
-pub struct Medium<'a> {
-    /// The density. Values are finite and not negative, and zero outside the active box.
-    pub density: &'a Channel,
-    /// Extinction per density and world length.
-    pub density_scale: f32,
+pub struct Volume<'a> {
+    /// Where the medium is, and its density there.
+    pub shape: Shape<'a>,
+    /// Extinction per density and world length, per colour.
+    pub extinction: [f32; 3],
     /// The share of extinction that is scattering, per colour, 0 to 1.
     pub albedo: [f32; 3],
-    /// The mean cosine g of the Henyey–Greenstein phase function; positive is forward.
-    pub phase_g: f32,
+    /// Where light goes that is scattered.
+    pub phase: Phase,
     /// Light that the medium gives off.
     pub emission: Option<Emission<'a>>,
+}
+
+impl<'a> Volume<'a> {
+    /// A medium of grey extinction that only absorbs.
+    pub fn absorbing(shape: Shape<'a>, extinction: f32) -> Self {
+        let phase = Phase::HenyeyGreenstein { g: 0.0 };
+        Volume { shape, extinction: [extinction; 3], albedo: [0.0; 3], phase, emission: None }
+    }
+}
+
+/// Where a medium is, and its density there.
+#[derive(Debug, Clone, Copy)]
+pub enum Shape<'a> {
+    /// The densities of a channel. They are finite and not negative, and zero outside the active box.
+    Grid(&'a Channel),
+    /// A density of 1 in what an invertible transform makes of the cube from 0 to 1.
+    Box {
+        /// World from cube.
+        world_from_unit: DAffine3,
+    },
+    /// A density of 1 in what an invertible transform makes of the ball of radius 1 around the origin.
+    Ball {
+        /// World from ball.
+        world_from_unit: DAffine3,
+    },
+}
+
+impl<'a> Shape<'a> {
+    /// The channel that holds the densities, if one does.
+    pub fn channel(self) -> Option<&'a Channel> {
+        match self {
+            Shape::Grid(channel) => Some(channel),
+            Shape::Box { .. } | Shape::Ball { .. } => None,
+        }
+    }
 }
 
 /// Light that a medium gives off, independent of its density.
 #[derive(Debug, Clone)]
 pub struct Emission<'a> {
-    /// What glows: a temperature or a flame. May have a transform of its own.
-    pub channel: &'a Channel,
+    /// What glows: a temperature or a flame. May have a transform of its own. If `None`, it is the density of the volume,
+    /// which is 1 in a box and in a ball.
+    pub channel: Option<&'a Channel>,
     /// How values become light.
     pub spectrum: Spectrum,
 }
@@ -76,25 +116,23 @@ impl Spectrum {
     }
 }
 
-/// A light infinitely far away. Not visible itself.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Sun {
-    /// The direction towards the sun, of length 1.
-    pub direction_to: Vec3,
-    /// Irradiance on a surface that faces the sun.
-    pub irradiance: [f32; 3],
-}
-
 /// Everything a picture depends on, but for how finely it is computed.
 #[derive(Debug, Clone)]
 pub struct Scene<'a> {
     /// The view.
     pub camera: Camera,
-    /// What is seen.
-    pub medium: Medium<'a>,
-    /// The sun, if it shines.
-    pub sun: Option<Sun>,
-    /// The radiance of the sky, the same from all directions. It lights the medium; what stands behind the
-    /// medium in the picture is the caller's business.
-    pub sky: [f32; 3],
+    /// What is seen. Volumes may overlap.
+    pub volumes: Vec<Volume<'a>>,
+    /// Lights with a place or a direction. They light the volumes and are not visible themselves.
+    pub lights: Vec<Light>,
+    /// The light from everywhere. What stands behind the volumes in the picture is the caller's business.
+    pub sky: Sky,
+}
+
+impl<'a> Scene<'a> {
+    /// A scene of one volume, lit by a sun, if there is one, and by a sky that is the same from everywhere.
+    pub fn of_one(camera: Camera, volume: Volume<'a>, sun: Option<Sun>, sky: [f32; 3]) -> Self {
+        let lights = sun.map(Light::Sun).into_iter().collect();
+        Scene { camera, volumes: vec![volume], lights, sky: Sky::Constant(sky) }
+    }
 }

@@ -13,9 +13,10 @@ use common::{
 };
 use glam::{DAffine3, DMat3, DQuat, DVec3, IVec3};
 use nuage_render::camera::Ray;
+use nuage_render::light::{Light, Sun};
 use nuage_render::march::{Marcher, Quality, Radiance};
 use nuage_render::phase::hg;
-use nuage_render::scene::{Emission, Scene, Spectrum, Sun};
+use nuage_render::scene::{Emission, Phase, Scene, Spectrum};
 use nuage_volume::build::TileSize;
 use nuage_volume::channel::Channel;
 
@@ -149,8 +150,10 @@ fn glowing_media_follow_the_closed_form() {
                 let length = depth(channel, with_step(0.125), &ray);
                 let sigma = tau / length;
                 let mut scene = absorbing(any_camera(), channel, sigma as f32);
-                scene.medium.emission =
-                    Some(Emission { channel, spectrum: Spectrum::Linear { rgb: [1.0, 2.0, 0.0] } });
+                scene.volumes[0].emission = Some(Emission {
+                    channel: Some(channel),
+                    spectrum: Spectrum::Linear { rgb: [1.0, 2.0, 0.0] },
+                });
                 let found = radiance(&scene, with_step(0.125), &ray);
                 let expected = (1.0 - f64::exp(-tau)) / sigma;
                 // Lattices differ between both ways of marching.
@@ -172,7 +175,7 @@ fn a_glow_without_density_adds_up() {
         let glow = tile(size, scaled());
         let mut scene = absorbing(any_camera(), &density, 1.0);
         let spectrum = Spectrum::Linear { rgb: [3.0; 3] };
-        scene.medium.emission = Some(Emission { channel: &glow, spectrum });
+        scene.volumes[0].emission = Some(Emission { channel: Some(&glow), spectrum });
         let expected = 3.0 * f64::from(tile_voxels(size)) * VOXEL;
         for ray in axis_rays(DVec3::splat(VOXEL * 3.3)) {
             let found = radiance(&scene, with_step(0.125), &ray);
@@ -194,7 +197,7 @@ fn density_in_front_dims_a_glow() {
         let glow = tile(TileSize::Node4, moved(z));
         let mut scene = absorbing(any_camera(), &density, sigma as f32);
         let spectrum = Spectrum::Linear { rgb: [1.0; 3] };
-        scene.medium.emission = Some(Emission { channel: &glow, spectrum });
+        scene.volumes[0].emission = Some(Emission { channel: Some(&glow), spectrum });
         let ray = Ray { origin: DVec3::new(5.0, 5.0, 3.0 * far), direction: DVec3::NEG_Z };
         let found = radiance(&scene, with_step(0.25), &ray);
         // 16 length units of glow 1000 away: the ends of its ramps have the precision of f32 at 1000.
@@ -214,9 +217,9 @@ fn sun_along_the_axes_has_closed_forms() {
             for tau in [0.1, 2.0] {
                 for (direction_to, cos) in [(ray.direction, 1.0), (-ray.direction, -1.0f64)] {
                     let mut scene = absorbing(any_camera(), &channel, (tau / length) as f32);
-                    scene.medium.albedo = [albedo as f32; 3];
-                    scene.medium.phase_g = 0.6;
-                    scene.sun = Some(Sun { direction_to: direction_to.as_vec3(), irradiance: [2.0; 3] });
+                    scene.volumes[0].albedo = [albedo as f32; 3];
+                    scene.volumes[0].phase = Phase::HenyeyGreenstein { g: 0.6 };
+                    scene.lights = vec![Light::Sun(Sun::point(direction_to.as_vec3(), [2.0; 3]))];
                     let found = radiance(&scene, with_step(0.25), &ray).scattered.x;
                     let share =
                         if cos > 0.0 { tau * f64::exp(-tau) } else { (1.0 - f64::exp(-2.0 * tau)) / 2.0 };

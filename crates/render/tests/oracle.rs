@@ -12,9 +12,10 @@ use std::time::Instant;
 use common::{Dense, absorbing};
 use glam::{DVec2, DVec3, Vec3};
 use nuage_render::camera::{Camera, Ray};
+use nuage_render::light::{Light, Sky, Sun};
 use nuage_render::march::{Marcher, Quality};
 use nuage_render::picture::render;
-use nuage_render::scene::{Emission, Spectrum, Sun};
+use nuage_render::scene::{Emission, Spectrum};
 use nuage_testkit::npy::{read_f32, read_raw_f64};
 use reference::{SIZE, camera, channel, json, lit_scene, numbers, path};
 
@@ -116,8 +117,8 @@ fn transmittance_follows_the_quadrature() {
 fn emission_follows_the_quadrature() {
     let (camera, density, emission) = (camera(&json()), channel("density"), channel("emission"));
     let mut scene = absorbing(camera, &density, 1.5);
-    scene.medium.emission =
-        Some(Emission { channel: &emission, spectrum: Spectrum::Linear { rgb: [1.0, 2.0, 0.25] } });
+    scene.volumes[0].emission =
+        Some(Emission { channel: Some(&emission), spectrum: Spectrum::Linear { rgb: [1.0, 2.0, 0.25] } });
     let reference = read_raw_f64(&path("emit_center.f64"));
     let largest = reference.iter().copied().fold(0.0, f64::max);
     let mean = reference.iter().sum::<f64>() / reference.len() as f64;
@@ -143,6 +144,7 @@ fn emission_follows_the_quadrature() {
 fn single_scattering_follows_another_renderer() {
     let (json, density) = (json(), channel("density"));
     let scene = lit_scene(&json, &density, 0.0);
+    let sky = scene.sky.radiance(Vec3::Y).to_array();
     let reference: Vec<f64> = read_f32(&path("het64_g0_ss_mean.npy")).into_iter().map(f64::from).collect();
     let stderr: Vec<f64> = read_f32(&path("het64_g0_ss_stderr.npy")).into_iter().map(f64::from).collect();
     let mean_of = |values: &[f64], channel: usize| {
@@ -164,7 +166,7 @@ fn single_scattering_follows_another_renderer() {
     let fine = Quality { samples: 8, ..Quality::default() };
     for (quality, limit_mean, limit_rms) in [(Quality::default(), 0.01, 0.01), (fine, 0.002, 0.005)] {
         let begin = Instant::now();
-        let image = render(&scene, quality, SIZE, SIZE, &|_, _| {}).expect("a picture").over(scene.sky);
+        let image = render(&scene, quality, SIZE, SIZE, &|_, _| {}).expect("a picture").over(sky);
         println!("single scattering at {quality:?}: {:.2} s", begin.elapsed().as_secs_f64());
         let values: Vec<f64> = image.pixels.iter().flat_map(|p| [p[0], p[1], p[2]]).map(f64::from).collect();
         for channel in 0..3 {
@@ -257,16 +259,17 @@ fn phase_function_and_lights_agree_with_brute_force() {
         let full = lit_scene(&json, &density, g);
         for (x, y) in [(64.5, 64.5), (50.5, 80.5)] {
             let ray = full.camera.ray(DVec2::new(x, y), SIZE, SIZE);
-            let sun = full.sun.expect("a sun");
+            let [Light::Sun(sun)] = full.lights[..] else { panic!("a sun") };
             let to_sun = sun.direction_to.as_dvec3();
-            let scale = full.medium.density_scale.into();
+            let scale = full.volumes[0].extinction[0].into();
             let expected = brute_force(&dense, &ray, scale, g.into(), to_sun);
             let mut found = [0.0; 2];
             for (which, found) in found.iter_mut().enumerate() {
                 let mut scene = full.clone();
-                scene.medium.albedo = [1.0; 3];
-                scene.sun = (which == 0).then_some(Sun { irradiance: [1.0; 3], ..sun });
-                scene.sky = if which == 1 { [1.0; 3] } else { [0.0; 3] };
+                scene.volumes[0].albedo = [1.0; 3];
+                let sun = Light::Sun(Sun { irradiance: [1.0; 3], ..sun });
+                scene.lights = if which == 0 { vec![sun] } else { Vec::new() };
+                scene.sky = Sky::Constant(if which == 1 { [1.0; 3] } else { [0.0; 3] });
                 let marcher = Marcher::new(&scene, quality);
                 let mut worker = marcher.worker();
                 let seeds = 16;
@@ -297,8 +300,8 @@ fn sun_along_the_view_has_closed_forms() {
     let mut checked = 0;
     for g in [0.0f32, 0.8, -0.5] {
         let mut scene = lit_scene(&json, &density, g);
-        scene.sky = [0.0; 3];
-        scene.medium.albedo = [1.0, 0.5, 0.25];
+        scene.sky = Sky::Constant([0.0; 3]);
+        scene.volumes[0].albedo = [1.0, 0.5, 0.25];
         for ray in pixel_centres(&scene.camera).step_by(97) {
             let tau = 8.0 * dense.line_integral(&ray);
             if tau < 0.01 {
@@ -307,7 +310,7 @@ fn sun_along_the_view_has_closed_forms() {
             for cos in [1.0, -1.0f64] {
                 let direction_to = (cos * ray.direction).normalize().as_vec3();
                 let mut scene = scene.clone();
-                scene.sun = Some(Sun { direction_to, irradiance: [4.0; 3] });
+                scene.lights = vec![Light::Sun(Sun::point(direction_to, [4.0; 3]))];
                 let marcher = Marcher::new(&scene, quality);
                 let light = marcher.radiance(&mut marcher.worker(), &ray, 5).scattered;
                 let g = f64::from(g);

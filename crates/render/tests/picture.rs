@@ -7,9 +7,10 @@ use common::{Dense, channel_of, empty};
 use glam::{DAffine3, DMat3, DVec3, IVec3};
 use nuage_render::camera::Camera;
 use nuage_render::film::Image;
+use nuage_render::light::{Sky, Sun};
 use nuage_render::march::Quality;
 use nuage_render::picture::render;
-use nuage_render::scene::{Emission, Medium, Scene, Spectrum, Sun};
+use nuage_render::scene::{Emission, Phase, Scene, Shape, Spectrum, Volume};
 use nuage_volume::channel::Channel;
 
 const SIZE: u32 = 40;
@@ -30,15 +31,15 @@ fn density() -> Channel {
 
 fn scene<'a>(density: &'a Channel, emission: Option<&'a Channel>) -> Scene<'a> {
     let spectrum = Spectrum::Linear { rgb: [0.1, 0.05, 0.02] };
-    let medium = Medium {
-        density,
-        density_scale: 0.3,
+    let volume = Volume {
+        shape: Shape::Grid(density),
+        extinction: [0.3; 3],
         albedo: [0.9, 0.8, 0.7],
-        phase_g: 0.3,
-        emission: emission.map(|channel| Emission { channel, spectrum }),
+        phase: Phase::HenyeyGreenstein { g: 0.3 },
+        emission: emission.map(|channel| Emission { channel: Some(channel), spectrum }),
     };
     let direction_to = DVec3::new(0.3, 1.0, 0.2).normalize().as_vec3();
-    Scene { camera: camera(), medium, sun: Some(Sun { direction_to, irradiance: [3.0; 3] }), sky: [0.5; 3] }
+    Scene::of_one(camera(), volume, Some(Sun::point(direction_to, [3.0; 3])), [0.5; 3])
 }
 
 fn picture(scene: &Scene<'_>, quality: Quality) -> Image {
@@ -87,8 +88,10 @@ fn single_scattering_stays_below_the_furnace() {
     let density = density();
     for (g, scale) in [(0.0, 0.3), (0.8, 0.3), (-0.5, 0.05), (0.0, 30.0)] {
         let mut scene = scene(&density, None);
-        (scene.sun, scene.sky) = (None, [1.0; 3]);
-        (scene.medium.albedo, scene.medium.phase_g, scene.medium.density_scale) = ([1.0; 3], g, scale);
+        (scene.lights, scene.sky) = (Vec::new(), Sky::Constant([1.0; 3]));
+        let volume = &mut scene.volumes[0];
+        (volume.albedo, volume.extinction) = ([1.0; 3], [scale; 3]);
+        volume.phase = Phase::HenyeyGreenstein { g };
         let quality = Quality { sky_rays: 64, samples: 4, ..Quality::default() };
         let alone = picture(&scene, quality);
         let image = alone.over([1.0; 3]);
@@ -104,8 +107,8 @@ fn single_scattering_stays_below_the_furnace() {
     }
     // Where the medium is thin, little scatters twice.
     let mut thin = scene(&density, None);
-    (thin.sun, thin.sky) = (None, [1.0; 3]);
-    (thin.medium.albedo, thin.medium.density_scale) = ([1.0; 3], 1e-3);
+    (thin.lights, thin.sky) = (Vec::new(), Sky::Constant([1.0; 3]));
+    (thin.volumes[0].albedo, thin.volumes[0].extinction) = ([1.0; 3], [1e-3; 3]);
     let mean = picture(&thin, Quality { sky_rays: 16, ..Quality::default() }).over([1.0; 3]).mean()[0];
     assert!((mean - 1.0).abs() < 1e-3, "{mean}");
 }
@@ -170,7 +173,7 @@ fn huge_densities_are_opaque_and_finite() {
         let density = channel_of(low, IVec3::splat(20), DAffine3::IDENTITY, |_| value);
         for density_scale in [1.0, f32::MAX] {
             let mut scene = scene(&density, Some(&density));
-            scene.medium.density_scale = density_scale;
+            scene.volumes[0].extinction = [density_scale; 3];
             let image = picture(&scene, Quality { samples: 1, ..Quality::default() });
             let finite = image.pixels.iter().flatten().all(|v| v.is_finite());
             assert!(finite, "{value:e} × {density_scale:e}");
@@ -188,7 +191,7 @@ fn huge_emission_is_never_nan() {
     let (thin, none) = (density(), empty());
     for density in [&huge, &thin, &none] {
         let mut scene = scene(density, Some(&huge));
-        if let Some(emission) = &mut scene.medium.emission {
+        if let Some(emission) = &mut scene.volumes[0].emission {
             emission.spectrum = Spectrum::Linear { rgb: [1.0, 1e6, 0.0] };
         }
         let image = picture(&scene, Quality { samples: 1, ..Quality::default() });

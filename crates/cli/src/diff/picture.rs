@@ -8,7 +8,6 @@ use std::path::{Path, PathBuf};
 
 use nuage_pipeline::output::write_whole;
 use nuage_render::film::{Image, contact_sheet};
-use nuage_render::framing::WorldBox;
 use nuage_render::output::png::encode_png;
 use serde_json::{Value, json};
 
@@ -47,13 +46,9 @@ pub(super) fn check_name(path: &Path) -> Result<(), Failure> {
 /// If one cannot be rendered, or the picture not be written.
 pub(super) fn write(path: &Path, pair: &Pair, args: &Args) -> Result<Picture, Failure> {
     let [a, b] = [load(&pair.files[0], args)?, load(&pair.files[1], args)?];
-    let boxes = [Some(&a.density), a.emission.as_ref()].into_iter().flatten();
-    let world_box = boxes.filter_map(WorldBox::of).reduce(WorldBox::union);
-    let volumes = [a];
-    let shot = Shot::new(&args.look, world_box, &volumes).map_err(Failure::Usage)?;
-    let [a] = &volumes;
+    let shot = Shot::new(&args.look, a.world_box(), std::slice::from_ref(&a)).map_err(Failure::Usage)?;
     let render = |volume: &Volume| shot.render(volume, &|_, _| ()).map_err(|e| Failure::Usage(e.to_string()));
-    let [a, b] = [render(a)?, render(&b)?];
+    let [a, b] = [render(&a)?, render(&b)?];
     let largest = a
         .pixels
         .iter()

@@ -19,8 +19,8 @@ use crate::look::Look;
 use crate::shot::{Shot, Volume};
 
 /// What is the same in all pictures of a channel.
-pub(crate) struct Studio<'l> {
-    shot: Shot<'l>,
+pub(crate) struct Studio {
+    shot: Shot,
     is_glowing: bool,
     /// The box of the source's active voxels.
     source_box: Option<IndexBox>,
@@ -59,12 +59,12 @@ pub(crate) fn look(name: &str, role: Role, size: u32) -> Result<Look, String> {
     Ok(Options::try_parse_from(options).map_err(|error| error.to_string())?.look)
 }
 
-impl<'l> Studio<'l> {
+impl Studio {
     /// Settles view and scales from a channel, and takes its picture.
     ///
     /// # Errors
     /// What is wrong, in words.
-    pub(crate) fn new(look: &'l Look, source: &Grid) -> Result<Self, String> {
+    pub(crate) fn new(look: &Look, source: &Grid) -> Result<Self, String> {
         let channel = channel(source.clone())?;
         let (world_box, source_box) = (WorldBox::of(&channel), channel.active_box);
         let is_glowing = look.flame.is_some() || look.temperature.is_some();

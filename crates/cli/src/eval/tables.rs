@@ -243,11 +243,7 @@ fn ours() -> [(&'static str, Options); 3] {
     [("nuage default", Options::default()), ("nuage 4 bits", bits(4.0)), ("nuage 2 bits", bits(2.0))]
 }
 
-fn format_rows(
-    model: &Model,
-    topology: &Topology,
-    studio: &mut Studio<'_>,
-) -> Result<Vec<Vec<Cell>>, String> {
+fn format_rows(model: &Model, topology: &Topology, studio: &mut Studio) -> Result<Vec<Vec<Cell>>, String> {
     let source = bricks(model.tree());
     let range = scheme::range(source);
     let voxels = (source.len() * BRICK_VOXELS) as f64;
@@ -316,7 +312,7 @@ const CLUSTERS_COLUMNS: &[[&str; 2]] = &[
     ["Of maximum", "rmse_of_max"],
 ];
 
-fn cluster_rows(model: &Model, studio: &mut Studio<'_>) -> Result<Vec<Vec<Cell>>, String> {
+fn cluster_rows(model: &Model, studio: &mut Studio) -> Result<Vec<Vec<Cell>>, String> {
     let source = bricks(model.tree());
     let range = scheme::range(source);
     // Each brick is encoded once, whatever it is replaced by.

@@ -7,7 +7,7 @@
 use glam::{DAffine3, DVec3, IVec3};
 use nuage_render::camera::{Camera, Ray};
 use nuage_render::hash::hash_u32;
-use nuage_render::scene::{Medium, Scene};
+use nuage_render::scene::{Scene, Shape, Volume};
 use nuage_volume::brick::{BrickSummary, Bricks};
 use nuage_volume::build::{TileSize, TreeBuilder};
 use nuage_volume::channel::{Channel, IndexBox};
@@ -67,8 +67,7 @@ pub fn boxed(min: IVec3, max: IVec3) -> impl Iterator<Item = IVec3> {
 
 /// A medium that only absorbs, without lights.
 pub fn absorbing(camera: Camera, density: &Channel, density_scale: f32) -> Scene<'_> {
-    let medium = Medium { density, density_scale, albedo: [0.0; 3], phase_g: 0.0, emission: None };
-    Scene { camera, medium, sun: None, sky: [0.0; 3] }
+    Scene::of_one(camera, Volume::absorbing(Shape::Grid(density), density_scale), None, [0.0; 3])
 }
 
 /// Any camera, for tests that shoot their rays themselves.

@@ -2,7 +2,8 @@
 
 use glam::DVec3;
 use nuage_render::camera::Camera;
-use nuage_render::scene::{Medium, Scene, Sun};
+use nuage_render::light::Sun;
+use nuage_render::scene::{Phase, Scene, Shape, Volume};
 use nuage_volume::channel::Channel;
 use serde_json::Value;
 
@@ -41,14 +42,13 @@ pub(crate) fn channel(name: &str) -> Channel {
 pub(crate) fn lit_scene<'a>(json: &Value, density: &'a Channel, phase_g: f32) -> Scene<'a> {
     let scene = &json["scenes"]["het64_g0_ss"];
     let travel = DVec3::from_array(numbers(&scene["sun_direction_of_travel"]));
-    let medium = Medium {
-        density,
-        density_scale: scene["sigma_scale"].as_f64().expect("a number") as f32,
+    let extinction = scene["sigma_scale"].as_f64().expect("a number") as f32;
+    let volume = Volume {
         albedo: colour(&scene["albedo"]),
-        phase_g,
-        emission: None,
+        phase: Phase::HenyeyGreenstein { g: phase_g },
+        ..Volume::absorbing(Shape::Grid(density), extinction)
     };
     let irradiance = colour(&scene["sun_irradiance"]);
-    let sun = Some(Sun { direction_to: (-travel).normalize().as_vec3(), irradiance });
-    Scene { camera: camera(json), medium, sun, sky: colour(&scene["sky_radiance"]) }
+    let sun = Sun::point((-travel).normalize().as_vec3(), irradiance);
+    Scene::of_one(camera(json), volume, Some(sun), colour(&scene["sky_radiance"]))
 }
