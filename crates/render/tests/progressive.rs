@@ -11,8 +11,9 @@ use glam::{DAffine3, DVec3, IVec3};
 use nuage_render::camera::Camera;
 use nuage_render::checkpoint;
 use nuage_render::film::{Film, Tally};
+use nuage_render::light::Sun;
 use nuage_render::progressive::{MIN_NOISE_SAMPLES, Plan, Stopped, Watch, trace};
-use nuage_render::scene::{Emission, Medium, Scene, Spectrum, Sun};
+use nuage_render::scene::{Emission, Phase, Scene, Shape, Spectrum, Volume};
 use nuage_volume::channel::Channel;
 
 /// A ball of radius 9 around (8, 8, 8), with soft edges.
@@ -24,17 +25,17 @@ fn density() -> Channel {
 /// The ball before nothing, lit by a sun and a sky; it glows a little. Some of the picture is empty.
 fn scene(density: &Channel) -> Scene<'_> {
     let camera = Camera::look_at(DVec3::new(8.0, 8.0, 60.0), DVec3::splat(8.0), DVec3::Y, 25.0);
-    let emission = Emission { channel: density, spectrum: Spectrum::Linear { rgb: [0.1, 0.05, 0.02] } };
-    let medium = Medium {
-        density,
-        density_scale: 0.3,
+    let emission = Emission { channel: None, spectrum: Spectrum::Linear { rgb: [0.1, 0.05, 0.02] } };
+    let volume = Volume {
+        shape: Shape::Grid(density),
+        extinction: [0.3; 3],
         albedo: [0.9, 0.8, 0.7],
-        phase_g: 0.3,
+        phase: Phase::HenyeyGreenstein { g: 0.3 },
         emission: Some(emission),
     };
     let direction_to = DVec3::new(0.3, 1.0, 0.2).normalize().as_vec3();
-    let sun = Some(Sun { direction_to, irradiance: [3.0, 2.5, 2.0] });
-    Scene { camera: camera.expect("a view"), medium, sun, sky: [0.5; 3] }
+    let sun = Sun::point(direction_to, [3.0, 2.5, 2.0]);
+    Scene::of_one(camera.expect("a view"), volume, Some(sun), [0.5; 3])
 }
 
 fn render(plan: &Plan, [width, height]: [u32; 2]) -> Film {
