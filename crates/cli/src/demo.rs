@@ -121,7 +121,7 @@ mod tests {
     fn the_demo_shows_fire_that_turns_to_smoke_and_can_be_repeated() {
         let mut look = look().unwrap();
         look.size = Size { width: 20, height: 27 };
-        look.samples = 1;
+        look.samples = Some(1);
         assert!(
             !Plan::of_look(&look, "", None).needs_volumes()
                 && look.camera.is_some()

@@ -119,7 +119,7 @@ pub(crate) struct Look {
     pub(crate) shadow_growth: f32,
 
     /// How light is followed: march (scattered once, smooth, with steps) or path (any number of times, unbiased, with
-    /// noise; takes --samples of 16 and more)
+    /// noise)
     #[arg(long, value_enum, default_value_t, value_name = "NAME", help_heading = "Quality")]
     pub(crate) integrator: Integrator,
 
@@ -127,9 +127,19 @@ pub(crate) struct Look {
     #[arg(long, value_parser = clap::value_parser!(u32).range(0..=1_000_000), value_name = "N", help_heading = "Quality")]
     pub(crate) scatterings: Option<u32>,
 
-    /// Camera rays per pixel; with --integrator path, as many paths
-    #[arg(long, default_value = "1", value_parser = clap::value_parser!(u32).range(1..=65536), value_name = "N", help_heading = "Quality")]
-    pub(crate) samples: u32,
+    /// Camera rays per pixel; with --integrator path, as many paths at most [default: 1; of paths 64, or with --noise or
+    /// --time as many as it takes]
+    #[arg(long, visible_alias = "spp", value_parser = clap::value_parser!(u32).range(1..=MOST_SAMPLES), value_name = "N", help_heading = "Quality")]
+    pub(crate) samples: Option<u32>,
+
+    /// With --integrator path, stop when the noise of the picture is no more than this: the root mean square over lit
+    /// pixels of the standard error of luminance over luminance, that of dark pixels plus a tenth of the mean
+    #[arg(long, value_parser = positive, value_name = "PART", help_heading = "Quality")]
+    pub(crate) noise: Option<f32>,
+
+    /// With --integrator path, stop after so many seconds of tracing, but not before each pixel has a path
+    #[arg(long, value_parser = seconds, value_name = "SECONDS", help_heading = "Quality")]
+    pub(crate) time: Option<f32>,
 
     /// A ray ends where less than this share of the light passes
     #[arg(long, default_value = "0.0003", value_parser = share, value_name = "T", help_heading = "Quality")]
@@ -150,6 +160,28 @@ pub(crate) struct Look {
     /// With --integrator path, see the sky only by paths that leave the volumes, not by rays of their own
     #[arg(long, help_heading = "Quality")]
     pub(crate) no_sky_rays: bool,
+}
+
+/// The most paths of a pixel that can be asked for.
+pub(crate) const MOST_SAMPLES: i64 = 1 << 24;
+
+/// The paths of a pixel if nothing is asked for.
+const DEFAULT_PATHS: u32 = 64;
+
+impl Look {
+    /// The most paths of a pixel.
+    pub(crate) fn paths(&self) -> u32 {
+        let has_end = self.noise.is_some() || self.time.is_some();
+        self.samples.unwrap_or(if has_end { u32::MAX } else { DEFAULT_PATHS })
+    }
+}
+
+/// Seconds, at most a month.
+pub(crate) fn seconds(text: &str) -> Result<f32, String> {
+    match positive(text)? {
+        seconds if seconds <= 2_678_400.0 => Ok(seconds),
+        _ => Err("seconds up to a month (2678400) are needed".into()),
+    }
 }
 
 /// A number that is not negative.

@@ -6,7 +6,6 @@
 
 mod convert;
 mod demo;
-#[expect(dead_code, reason = "no option asks for it yet")]
 mod denoise;
 mod diff;
 mod error;
@@ -27,6 +26,7 @@ mod shot;
 mod source;
 mod text;
 mod texture;
+mod trace;
 mod validate;
 mod values;
 mod verify;

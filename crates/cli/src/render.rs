@@ -1,5 +1,6 @@
 //! `nuage render`: one file, or a sequence of them, to pictures.
 
+use std::borrow::Cow;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -12,16 +13,19 @@ use nuage_render::film::Image;
 use nuage_render::framing::WorldBox;
 use nuage_render::output::exr::{ExrPrecision, encode_exr};
 use nuage_render::output::png::encode_png;
+use nuage_render::progressive::Stopped;
 use nuage_volume::channel::IndexBox;
 
+use crate::denoise;
 use crate::error::Failure;
 use crate::frames;
-use crate::look::Look;
+use crate::look::{Integrator, Look};
 use crate::plan::{Given, Plan, SkyPlan, VolumePlan, What};
 use crate::progress;
 use crate::scene_file::{self, RunKeys};
 use crate::shot::{self, Shot, Volume};
 use crate::source::DiskFile;
+use crate::trace::{self, Traced, checkpoint_path};
 
 /// Volumes of a sequence that are looked at to settle automatic scales.
 const FITTED_FRAMES: usize = 5;
@@ -64,9 +68,22 @@ pub(crate) struct Args {
     #[arg(long)]
     overwrite: bool,
 
-    /// Leave out frames whose picture is there
+    /// Leave out frames whose picture is there; with --checkpoint, go on with those that are kept
     #[arg(long, conflicts_with = "overwrite")]
     resume: bool,
+
+    /// With --integrator path, keep what is traced beside the picture, as PICTURE.checkpoint, so that --resume can add to it
+    #[arg(long)]
+    checkpoint: bool,
+
+    /// With --integrator path, write an .exr of several layers: light given off, scattered once and more often, albedo,
+    /// depth, transmittance, standard errors, number of paths; and the scene in its head
+    #[arg(long)]
+    aovs: bool,
+
+    /// With --integrator path, have Open Image Denoise (the program oidnDenoise, where installed) take the noise away
+    #[arg(long)]
+    denoise: bool,
 
     /// Write EXR with 32-bit floats in place of 16-bit ones
     #[arg(long)]
@@ -85,10 +102,12 @@ pub(crate) struct Args {
 }
 
 /// A frame to be rendered.
-struct Job {
+pub(crate) struct Job {
     /// The files of the volumes, in the order of the plan; nothing for those that come from no file.
-    inputs: Vec<Option<PathBuf>>,
-    output: PathBuf,
+    pub(crate) inputs: Vec<Option<PathBuf>>,
+    pub(crate) output: PathBuf,
+    /// Whether it may be there already.
+    replaces: bool,
 }
 
 /// The number of a frame, and the files of its volumes.
@@ -124,6 +143,9 @@ pub(crate) fn run(args: &Args, given: &Given) -> Result<(), Failure> {
     let Some(output) = run.output.as_deref() else {
         return Err(Failure::Usage("the scene names no picture to write: give --output".into()));
     };
+    let is_traced = plan.look.integrator == Integrator::Path;
+    check(&plan.look, &run, Path::new(output)).map_err(Failure::Usage)?;
+    let denoiser = if run.denoise { Some(denoise::find()?) } else { None };
     let frames = find_inputs(&plan, run.frames.as_ref())?;
     let mut jobs = Vec::new();
     for (number, inputs) in &frames {
@@ -131,12 +153,15 @@ pub(crate) fn run(args: &Args, given: &Given) -> Result<(), Failure> {
         // A name that cannot be encoded is said before anything is rendered.
         let _ = encoder(&output, run.exr_float)?;
         match output.exists() {
+            true if run.resume && run.checkpoint && checkpoint_path(&output).exists() => {
+                jobs.push(Job { inputs: inputs.clone(), output, replaces: true });
+            }
             true if run.resume => {}
             true if !run.overwrite => {
                 let what = "the picture is there already; --overwrite replaces it, --resume leaves it out";
                 return Err(Failure::file(&output, what));
             }
-            _ => jobs.push(Job { inputs: inputs.clone(), output }),
+            _ => jobs.push(Job { inputs: inputs.clone(), output, replaces: run.overwrite }),
         }
     }
     if jobs.is_empty() && args.save_scene.is_none() {
@@ -159,17 +184,24 @@ pub(crate) fn run(args: &Args, given: &Given) -> Result<(), Failure> {
         write_whole(path, text.as_bytes(), run.overwrite).map_err(|e| plain(path, e))?;
     }
     let mut loaded = if frames.len() == 1 { volumes.pop() } else { None };
+    if is_traced {
+        trace::watch_for_interrupt()?;
+    }
     let bar = progress::bar(jobs.len());
     let mut failed = false;
     for (i, job) in jobs.iter().enumerate() {
         bar.set_message(job.output.display().to_string());
         let show = |done, total| progress::show(&bar, i, done, total);
-        if let Err(failure) = render_frame(&run, &shot, job, loaded.take(), &show) {
+        if let Err(failure) = render_frame(&run, &shot, job, loaded.take(), denoiser.as_deref(), &show) {
             if let Failure::Usage(_) = failure {
                 return Err(failure);
             }
             bar.suspend(|| failure.report());
             failed = true;
+        }
+        if trace::is_cancelled() {
+            failed = true;
+            break;
         }
     }
     bar.finish_and_clear();
@@ -190,6 +222,30 @@ fn overrule(run: &mut RunKeys, args: &Args) {
     run.exr_float |= args.exr_float;
     run.threads = args.threads.or(run.threads);
     run.timing |= args.timing;
+    run.checkpoint |= args.checkpoint;
+    run.aovs |= args.aovs;
+    run.denoise |= args.denoise;
+}
+
+/// What only paths have is not asked of other integrators, and layers not of a .png.
+fn check(look: &Look, run: &RunKeys, output: &Path) -> Result<(), String> {
+    let of_paths = [
+        ("--noise", look.noise.is_some()),
+        ("--time", look.time.is_some()),
+        ("--checkpoint", run.checkpoint),
+        ("--aovs", run.aovs),
+        ("--denoise", run.denoise),
+    ];
+    if let Some((name, _)) = of_paths.iter().find(|(_, is_asked)| *is_asked)
+        && look.integrator != Integrator::Path
+    {
+        return Err(format!("{name} is for --integrator path"));
+    }
+    let is_exr = output.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("exr"));
+    if run.aovs && !is_exr {
+        return Err("--aovs takes an .exr: a .png has no layers".into());
+    }
+    Ok(())
 }
 
 /// The frames to be rendered, each with its number and the files of its volumes.
@@ -259,6 +315,7 @@ fn render_frame(
     shot: &Shot,
     job: &Job,
     loaded: Option<Vec<Option<Volume>>>,
+    denoiser: Option<&Path>,
     progress: &(dyn Fn(u32, u32) + Sync),
 ) -> Result<(), Failure> {
     let start = Instant::now();
@@ -271,11 +328,31 @@ fn render_frame(
         return Err(Failure::Usage(what));
     }
     let read = start.elapsed();
-    let image = shot.render_frame(&volumes, progress).map_err(|e| Failure::Usage(e.to_string()))?;
+    let traced = match shot.plan().look.integrator {
+        Integrator::Path => Some(trace::render(run, shot, job, &volumes, denoiser, progress)?),
+        Integrator::March => None,
+    };
+    let bytes = match &traced {
+        Some(traced) => Cow::Borrowed(&traced.bytes),
+        None => {
+            let image = shot.render_frame(&volumes, progress).map_err(|e| Failure::Usage(e.to_string()))?;
+            Cow::Owned(encoder(&job.output, run.exr_float)?(&image).map_err(|e| plain(&job.output, e))?)
+        }
+    };
     let rendered = start.elapsed();
-    let bytes = encoder(&job.output, run.exr_float)?(&image).map_err(|e| plain(&job.output, e))?;
     // What was there is replaced only if that was asked for when it was found.
-    write_whole(&job.output, &bytes, run.overwrite).map_err(|e| plain(&job.output, e))?;
+    write_whole(&job.output, &bytes, job.replaces).map_err(|e| plain(&job.output, e))?;
+    if let Some(Traced { samples, noise, stopped, .. }) = traced
+        && (run.timing || stopped == Stopped::Cancelled)
+    {
+        let why = match stopped {
+            Stopped::Samples => "",
+            Stopped::Noise => ", the noise that was asked for",
+            Stopped::Time => ", time was up",
+            Stopped::Cancelled => ", called off",
+        };
+        note(&format!("{}: {samples} paths per pixel, noise {noise:.4}{why}", job.output.display()));
+    }
     if run.timing {
         note(&format!(
             "{}: read {:.0} ms, render {:.0} ms, write {:.0} ms",
@@ -419,10 +496,10 @@ fn picture(path: &Path) -> Result<([u32; 2], Vec<[f32; 3]>), Failure> {
     Ok(([side(width), side(height)], pixels))
 }
 
-type Encode = Box<dyn Fn(&Image) -> Result<Vec<u8>, nuage_render::output::OutputError>>;
+pub(crate) type Encode = Box<dyn Fn(&Image) -> Result<Vec<u8>, nuage_render::output::OutputError>>;
 
 /// How a picture of that name is encoded.
-fn encoder(path: &Path, exr_float: bool) -> Result<Encode, Failure> {
+pub(crate) fn encoder(path: &Path, exr_float: bool) -> Result<Encode, Failure> {
     let extension = path.extension().and_then(|e| e.to_str()).unwrap_or_default().to_ascii_lowercase();
     match extension.as_str() {
         "png" => Ok(Box::new(encode_png)),

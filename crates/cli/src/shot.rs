@@ -5,6 +5,7 @@
 //! themselves are made by the libraries.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use glam::{DAffine3, DVec3};
 use nuage_pipeline::import::{self, Report};
@@ -12,12 +13,13 @@ use nuage_pipeline::select;
 use nuage_render::camera::Camera;
 use nuage_render::color::Blackbody;
 use nuage_render::envmap::{self, EnvironmentMap};
-use nuage_render::film::{Image, ImageSizeError};
+use nuage_render::film::{Film, Image, ImageSizeError};
 use nuage_render::framing::{self, WorldBox};
 use nuage_render::light::{Light, Sky, Sun};
 use nuage_render::march::{self, Quality};
 use nuage_render::path::PathSettings;
 use nuage_render::picture;
+use nuage_render::progressive::{self, Stopped, Watch};
 use nuage_render::scene::{self, Emission, Phase, Scene, Shape, Spectrum};
 use nuage_vdb::{File, Source};
 use nuage_volume::channel::Channel;
@@ -323,6 +325,42 @@ impl Shot {
         self.render_scene(&self.scene(frame), progress)
     }
 
+    /// The size of the picture.
+    pub(crate) fn size(&self) -> [u32; 2] {
+        [self.plan.look.size.width, self.plan.look.size.height]
+    }
+
+    /// Traces the paths of a frame into a film, from where it stands.
+    pub(crate) fn trace(&self, frame: &Frame<'_>, film: &mut Film, watch: &mut Watch<'_>) -> Stopped {
+        progressive::trace(&self.scene(frame), &self.paths(), film, watch)
+    }
+
+    /// A picture with the background behind it.
+    pub(crate) fn before_background(&self, image: Image, frame: &Frame<'_>) -> Image {
+        self.before(image, &self.scene(frame))
+    }
+
+    fn before(&self, image: Image, scene: &Scene<'_>) -> Image {
+        match self.plan.look.background {
+            Background::None => image,
+            Background::Sky => before_sky(image, scene),
+            Background::Rgb(rgb) => image.over(rgb),
+        }
+    }
+
+    /// Which paths are traced.
+    fn paths(&self) -> progressive::Plan {
+        let look = &self.plan.look;
+        progressive::Plan {
+            settings: PathSettings { max_scatterings: look.scatterings, sky_rays: !look.no_sky_rays },
+            seed: look.seed,
+            pass_samples: 1,
+            samples: look.paths(),
+            noise: look.noise.map(f64::from),
+            time: look.time.map(Duration::from_secs_f32),
+        }
+    }
+
     fn render_scene(
         &self,
         scene: &Scene<'_>,
@@ -336,22 +374,20 @@ impl Shot {
             min_transmittance: look.cutoff,
             sun_rays: look.sun_rays,
             sky_rays: look.sky_rays,
-            samples: look.samples,
+            samples: look.samples.unwrap_or(1),
         };
         let Size { width, height } = look.size;
         let image = match look.integrator {
             Integrator::March => picture::render(scene, quality, width, height, progress)?,
             Integrator::Path => {
-                let settings =
-                    PathSettings { max_scatterings: look.scatterings, sky_rays: !look.no_sky_rays };
-                picture::trace(scene, settings, look.samples, look.seed, [width, height], progress)?.image
+                let mut film = Film::new(width, height)?;
+                let tile = |share: f64| progress((share.clamp(0.0, 1.0) * 1000.0) as u32, 1000);
+                let mut watch = Watch { tile: Some(&tile), ..Watch::default() };
+                progressive::trace(scene, &self.paths(), &mut film, &mut watch);
+                film.image()
             }
         };
-        let image = match look.background {
-            Background::None => image,
-            Background::Sky => before_sky(image, scene),
-            Background::Rgb(rgb) => image.over(rgb),
-        };
+        let image = self.before(image, scene);
         Ok(if look.exposure == 0.0 { image } else { image.exposed(look.exposure) })
     }
 }

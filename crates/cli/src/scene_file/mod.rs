@@ -17,7 +17,7 @@ use nuage_render::light::{Light, Spot};
 use toml::de::DeTable;
 
 use crate::error::Failure;
-use crate::look::{Integrator, Look, not_negative, share, up};
+use crate::look::{Integrator, Look, MOST_SAMPLES, not_negative, seconds, share, up};
 use crate::plan::{
     EmissionPlan, Extinction, Given, Glow, LightPlan, PhasePlan, Plan, SkyPlan, VolumePlan, What,
 };
@@ -38,6 +38,9 @@ pub(crate) struct RunKeys {
     pub(crate) exr_float: bool,
     pub(crate) threads: Option<u16>,
     pub(crate) timing: bool,
+    pub(crate) checkpoint: bool,
+    pub(crate) aovs: bool,
+    pub(crate) denoise: bool,
 }
 
 /// Reads a scene file. Of the options, those that were given keep their values.
@@ -102,7 +105,10 @@ fn parse(text: &str, folder: &Path, look: &Look, given: &Given) -> Result<(Plan,
                 .map_err(|_| "'march' or 'path' is needed".into())
         })?;
         put(given, "integrator", &mut look.integrator, kind);
-        put(given, "samples", &mut look.samples, integrator.parsed("samples", count(1, 65536))?);
+        let samples = integrator.parsed("samples", count(1, MOST_SAMPLES as u32))?;
+        put(given, "samples", &mut look.samples, samples.map(Some));
+        put(given, "noise", &mut look.noise, integrator.parsed("noise", values::positive)?.map(Some));
+        put(given, "time", &mut look.time, integrator.parsed("time", seconds)?.map(Some));
         put(given, "seed", &mut look.seed, integrator.parsed("seed", count(0, u32::MAX))?);
         let scatterings = integrator.parsed("scatterings", count(0, 1_000_000))?;
         put(given, "scatterings", &mut look.scatterings, scatterings.map(Some));
@@ -132,6 +138,9 @@ fn parse(text: &str, folder: &Path, look: &Look, given: &Given) -> Result<(Plan,
         run.exr_float = output.flag("exr_float")?.unwrap_or(false);
         run.threads = output.parsed("threads", count(1, 1024))?.and_then(|threads| threads.try_into().ok());
         run.timing = output.flag("timing")?.unwrap_or(false);
+        run.checkpoint = output.flag("checkpoint")?.unwrap_or(false);
+        run.aovs = output.flag("aovs")?.unwrap_or(false);
+        run.denoise = output.flag("denoise")?.unwrap_or(false);
         output.finish()?;
     }
     let sky = match root.table("sky")? {

@@ -50,7 +50,9 @@ pub(crate) fn save(plan: &Plan, run: &RunKeys, folder: &Path) -> String {
         "[integrator]",
         vec![
             ("kind", kind),
-            ("samples", Some(look.samples.to_string())),
+            ("samples", look.samples.map(|samples| samples.to_string())),
+            ("noise", look.noise.map(|noise| noise.to_string())),
+            ("time", look.time.map(|time| time.to_string())),
             ("seed", Some(look.seed.to_string())),
             ("scatterings", look.scatterings.map(|most| most.to_string())),
             ("step", Some(look.step.to_string())),
@@ -74,6 +76,9 @@ pub(crate) fn save(plan: &Plan, run: &RunKeys, folder: &Path) -> String {
             ("exr_float", yes(run.exr_float)),
             ("threads", run.threads.map(|threads| threads.to_string())),
             ("timing", yes(run.timing)),
+            ("checkpoint", yes(run.checkpoint)),
+            ("aovs", yes(run.aovs)),
+            ("denoise", yes(run.denoise)),
         ],
     );
     table(
