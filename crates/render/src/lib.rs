@@ -16,7 +16,9 @@
 pub mod blocks;
 pub mod camera;
 pub mod color;
+pub mod depth;
 pub mod film;
+pub mod filter;
 pub mod framing;
 pub mod hash;
 pub mod march;
@@ -26,4 +28,5 @@ pub mod path;
 pub mod phase;
 pub mod picture;
 pub mod scene;
+mod simd;
 pub mod traverse;

@@ -9,7 +9,8 @@
 //! Digital Differential Analyzer for Efficient Ray-Marching in OpenVDB", 2014.
 
 use glam::{DMat3, DVec3, IVec3, Mat3, Vec3};
-use nuage_volume::accessor::Accessor;
+use nuage_volume::accessor::{Accessor, BrickPlace};
+use nuage_volume::brick::Bounds;
 use nuage_volume::channel::Channel;
 use nuage_volume::space::LOG2_NODE5_BRICKS;
 use nuage_volume::tree::Content;
@@ -89,6 +90,23 @@ pub struct Segment {
     pub max: f32,
 }
 
+/// A stretch of a ray through one brick, or through more of one value.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct BrickSpan {
+    /// Where it begins.
+    pub(crate) t0: f32,
+    /// Where it ends.
+    pub(crate) t1: f32,
+    /// Bounds of all that trilinear interpolation gives there.
+    pub(crate) bounds: Bounds,
+    /// The brick in which it begins.
+    pub(crate) brick: IVec3,
+    /// The first voxel of that brick, as a position of the walk.
+    pub(crate) corner: Vec3,
+    /// The brick's entry; `None` inside a tile.
+    pub(crate) entry: Option<usize>,
+}
+
 impl<'a> Field<'a> {
     /// Makes a channel ready. `None` if it has no active voxel or is zero everywhere.
     pub fn new(channel: &'a Channel) -> Option<Self> {
@@ -148,6 +166,11 @@ impl<'a> Field<'a> {
     pub fn local(&self, ray: &Ray, start: f64) -> LocalRay {
         let origin = self.index_from_world * (ray.origin + ray.direction * start) + self.offset;
         LocalRay::new(origin.as_vec3(), (self.index_from_world * ray.direction).as_vec3())
+    }
+
+    /// Voxels per world length along a ray.
+    pub(crate) fn voxels_per_length(&self, ray: &Ray) -> f64 {
+        (self.index_from_world * ray.direction).length()
     }
 
     /// Takes directions of the world to positions of this field.
@@ -217,6 +240,11 @@ impl LocalRay {
     #[inline]
     pub fn at(&self, t: f32) -> Vec3 {
         self.origin + self.direction * t
+    }
+
+    /// One over the direction.
+    pub(crate) fn inverse(&self) -> Vec3 {
+        self.inverse
     }
 
     /// Where the ray enters and leaves a box; empty if it misses.
@@ -290,6 +318,58 @@ impl Runs<'_, '_> {
         None
     }
 
+    /// The next brick or homogeneous part of a tile that is not empty. To be used instead of the iterator.
+    #[inline(always)]
+    pub(crate) fn next_brick(&mut self) -> Option<BrickSpan> {
+        while self.t < self.t_end {
+            let (t0, brick) = (self.t, self.brick);
+            let (bounds, entry) = match self.accessor.place(brick) {
+                BrickPlace::Entry(entry) => {
+                    self.step_brick();
+                    (self.accessor.tree().node4.footprints[entry], Some(entry))
+                }
+                BrickPlace::Zero => {
+                    self.step_brick();
+                    continue;
+                }
+                BrickPlace::Tile => (self.cross_tile(), None),
+            };
+            let t1 = self.t.min(self.t_end);
+            if bounds.min < bounds.max || bounds.max != 0.0 {
+                if t0 < t1 {
+                    let corner = (brick.wrapping_sub(self.base_brick)).as_vec3() * 8.0;
+                    return Some(BrickSpan { t0, t1, bounds, brick, corner, entry });
+                }
+            }
+        }
+        None
+    }
+
+    /// Moves on through a tile as far as it has one value, or by one brick of the layer that blends with the neighbours.
+    /// Returns bounds of what was crossed.
+    #[inline(never)]
+    fn cross_tile(&mut self) -> Bounds {
+        let region = self.accessor.region(self.brick);
+        let (origin, last) = extent(self.brick, region.log2_bricks);
+        if region.footprint.is_constant() {
+            self.leap_over(origin, last);
+            if region.footprint.max == 0.0 && region.log2_bricks == LOG2_NODE5_BRICKS {
+                self.leap_to_root_entry();
+            }
+            return region.footprint;
+        }
+        match region.content {
+            Content::Constant(value) if self.brick.cmplt(last).all() => {
+                self.leap_over(origin, last - 1);
+                Bounds::of(value)
+            }
+            _ => {
+                self.step_brick();
+                region.footprint
+            }
+        }
+    }
+
     /// Moves on to the next brick.
     #[inline]
     fn step_brick(&mut self) {
@@ -317,6 +397,11 @@ impl Runs<'_, '_> {
     /// Moves on to where the ray leaves a region of more than one brick, and to the brick behind.
     fn leap(&mut self, log2_bricks: u32) {
         let (origin, last) = extent(self.brick, log2_bricks);
+        self.leap_over(origin, last);
+    }
+
+    /// Moves on to where the ray leaves a box of bricks, first and last, and to the brick behind.
+    fn leap_over(&mut self, origin: IVec3, last: IVec3) {
         let forward = self.ray.direction.cmpge(Vec3::ZERO);
         let faces = IVec3::select(forward, last + 1, origin);
         let t = self.faces_at(faces);
