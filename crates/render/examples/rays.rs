@@ -87,6 +87,17 @@ fn pixels_of<'r, 'a: 'r>(
                 1.0 - (-extinction * optical_depth(field, reader, &ray(x, y), filter)).exp()
             })
         }
+        "count" => Box::new(move |reader, x, y| {
+            let r = ray(x, y);
+            let Some([a, b]) = field.interval(&r) else { return 0.0 };
+            let local = field.local(&r, a);
+            let mut runs = field.runs(&mut reader.walker, local, 0.0, (b - a) as f32);
+            let mut n = 0;
+            while runs.next_segment().is_some() {
+                n += 1;
+            }
+            n as f32
+        }),
         _ => return Err(format!("no kernel '{kernel}'").into()),
     })
 }

@@ -86,15 +86,15 @@ impl<'a> Blocks<'a> {
         mix(low, high, x)
     }
 
-    /// The block of the entry of a brick.
-    #[inline]
-    pub(crate) fn of_entry(&mut self, entry: usize, brick: IVec3) -> &Block {
+    /// The block of an entry, whose brick is asked for when the block is made.
+    #[inline(always)]
+    pub(crate) fn of_entry(&mut self, entry: usize, brick: impl Fn() -> IVec3) -> &Block {
         let slot = &self.store.blocks[entry];
         match slot.get() {
             Some(block) => block,
             None => {
                 let accessor = &mut self.accessor;
-                slot.get_or_init(|| decode_first(accessor, brick))
+                slot.get_or_init(|| decode_first(accessor, brick()))
             }
         }
     }

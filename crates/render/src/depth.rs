@@ -14,7 +14,8 @@ use crate::blocks::{Block, Blocks, SIDE};
 use crate::camera::Ray;
 use crate::filter::Filter;
 use crate::simd::level;
-use crate::traverse::{BrickSpan, Field, LocalRay, Reader, floor};
+use crate::traverse::{Field, LocalRay, Reader, floor};
+use crate::walk::{BrickSpan, MapWalk, SpanContent, Spans};
 
 /// The values of a brick lie at less than this, in voxels from its first corner.
 const BRICK_END: f32 = 7.999_999_5;
@@ -100,20 +101,44 @@ fn stepped_on<'a, S: Simd, const NEAREST: bool>(
     // t = 0 is the first sample in the field.
     let start = (start / step).ceil() * step;
     let local = filter_ray::<NEAREST>(field.local(ray, start));
+    let (length, step) = ((end - start) as f32, step as f32);
     let Reader { walker, blocks, .. } = reader;
-    let mut spans = field.runs(walker, local, 0.0, (end - start) as f32);
-    let step = step as f32;
+    match field.map() {
+        Some(map) => {
+            let walk = MapWalk::new(simd, map, field, walker, local, 0.0, length);
+            step_spans::<S, NEAREST>(simd, field, blocks, &local, walk, step, extinction)
+        }
+        None => {
+            let runs = field.runs(walker, local, 0.0, length);
+            step_spans::<S, NEAREST>(simd, field, blocks, &local, runs, step, extinction)
+        }
+    }
+}
+
+#[inline(always)]
+fn step_spans<'a, S: Simd, const NEAREST: bool>(
+    simd: S,
+    field: &Field<'a>,
+    blocks: &mut Blocks<'a>,
+    local: &LocalRay,
+    mut spans: impl Spans,
+    step: f32,
+    extinction: f32,
+) -> f32 {
     let per_step = 1.0 / step;
     let loss = extinction * step;
     let lanes = f32x8::simd_from(simd, [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0]);
     let mut passes = f32x8::splat(simd, 1.0);
-    while let Some(span) = spans.next_brick() {
+    while let Some(span) = spans.next_span() {
         let (first, end) = ((span.t0 * per_step).ceil(), (span.t1 * per_step).ceil());
-        let Some(block) = block_of(blocks, &span) else {
-            passes[0] *= power(1.0 - loss * span.bounds.max, (end - first) as u32);
-            continue;
+        let block = match block_of(field, blocks, &span) {
+            Ok(block) => block,
+            Err(value) => {
+                passes[0] *= power(1.0 - loss * value, (end - first) as u32);
+                continue;
+            }
         };
-        let brick = BrickRay::new(simd, &local, &span);
+        let brick = BrickRay::new(simd, local, &span);
         let mut sample = first;
         while sample < end {
             let number = lanes + sample;
@@ -137,16 +162,39 @@ fn optical_depth_on<'a, S: Simd, const NEAREST: bool>(
 ) -> f32 {
     let Some([start, end]) = field.interval(ray) else { return 0.0 };
     let local = filter_ray::<NEAREST>(field.local(ray, start));
+    let length = (end - start) as f32;
     let Reader { walker, blocks, .. } = reader;
-    let mut spans = field.runs(walker, local, 0.0, (end - start) as f32);
+    match field.map() {
+        Some(map) => {
+            let walk = MapWalk::new(simd, map, field, walker, local, 0.0, length);
+            integrate_spans::<S, NEAREST>(simd, field, blocks, &local, walk)
+        }
+        None => {
+            let runs = field.runs(walker, local, 0.0, length);
+            integrate_spans::<S, NEAREST>(simd, field, blocks, &local, runs)
+        }
+    }
+}
+
+#[inline(always)]
+fn integrate_spans<'a, S: Simd, const NEAREST: bool>(
+    simd: S,
+    field: &Field<'a>,
+    blocks: &mut Blocks<'a>,
+    local: &LocalRay,
+    mut spans: impl Spans,
+) -> f32 {
     let mut depth = f32x8::splat(simd, 0.0);
-    while let Some(span) = spans.next_brick() {
-        let Some(block) = block_of(blocks, &span) else {
-            depth[0] += span.bounds.max * (span.t1 - span.t0);
-            continue;
+    while let Some(span) = spans.next_span() {
+        let block = match block_of(field, blocks, &span) {
+            Ok(block) => block,
+            Err(value) => {
+                depth[0] += value * (span.t1 - span.t0);
+                continue;
+            }
         };
-        let brick = BrickRay::new(simd, &local, &span);
-        let crossings = Crossings::of(&local, &span);
+        let brick = BrickRay::new(simd, local, &span);
+        let crossings = Crossings::of(local, &span);
         let mut cell = 0;
         while cell < crossings.cells {
             let t0 = f32x8::from_slice(simd, &crossings.t[cell..cell + 8]);
@@ -162,16 +210,18 @@ fn optical_depth_on<'a, S: Simd, const NEAREST: bool>(
     ((a + b) + (c + d)) + ((e + f) + (g + h))
 }
 
-/// The values of the brick of a span; `None` where it is homogeneous.
+/// The values of the brick of a span, or the one value that it has.
 #[inline(always)]
-fn block_of<'b>(blocks: &'b mut Blocks<'_>, span: &BrickSpan) -> Option<&'b Block> {
-    if span.bounds.is_constant() {
-        return None;
+fn block_of<'b, 'a>(
+    field: &Field<'a>,
+    blocks: &'b mut Blocks<'a>,
+    span: &BrickSpan,
+) -> Result<&'b Block, f32> {
+    match span.content {
+        SpanContent::Entry(entry) => Ok(blocks.of_entry(entry as usize, || field.brick_at(span.corner))),
+        SpanContent::Constant(value) => Err(value),
+        SpanContent::TileBorder => Ok(blocks.of_tile(field.brick_at(span.corner))),
     }
-    Some(match span.entry {
-        Some(entry) => blocks.of_entry(entry, span.brick),
-        None => blocks.of_tile(span.brick),
-    })
 }
 
 /// x to a whole power, the same on every platform.

@@ -30,3 +30,4 @@ pub mod picture;
 pub mod scene;
 mod simd;
 pub mod traverse;
+mod walk;

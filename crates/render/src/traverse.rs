@@ -8,15 +8,17 @@
 //! After Amanatides & Woo, "A Fast Voxel Traversal Algorithm for Ray Tracing", 1987, and Museth, "Hierarchical
 //! Digital Differential Analyzer for Efficient Ray-Marching in OpenVDB", 2014.
 
+use std::sync::OnceLock;
+
 use glam::{DMat3, DVec3, IVec3, Mat3, Vec3};
 use nuage_volume::accessor::{Accessor, BrickPlace};
-use nuage_volume::brick::Bounds;
 use nuage_volume::channel::Channel;
 use nuage_volume::space::LOG2_NODE5_BRICKS;
 use nuage_volume::tree::Content;
 
 use crate::blocks::{BlockStore, Blocks};
 use crate::camera::Ray;
+use crate::walk::{BrickMap, BrickSpan, SpanContent};
 
 /// A channel made ready for rays: its transform inverted, its extent in the coordinates of the walk.
 ///
@@ -26,6 +28,8 @@ use crate::camera::Ray;
 pub struct Field<'a> {
     channel: &'a Channel,
     blocks: BlockStore,
+    /// Made when the first ray asks for it.
+    map: OnceLock<Option<BrickMap>>,
     index_from_world: DMat3,
     /// World origin in positions of the walk.
     offset: DVec3,
@@ -90,23 +94,6 @@ pub struct Segment {
     pub max: f32,
 }
 
-/// A stretch of a ray through one brick, or through more of one value.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct BrickSpan {
-    /// Where it begins.
-    pub(crate) t0: f32,
-    /// Where it ends.
-    pub(crate) t1: f32,
-    /// Bounds of all that trilinear interpolation gives there.
-    pub(crate) bounds: Bounds,
-    /// The brick in which it begins.
-    pub(crate) brick: IVec3,
-    /// The first voxel of that brick, as a position of the walk.
-    pub(crate) corner: Vec3,
-    /// The brick's entry; `None` inside a tile.
-    pub(crate) entry: Option<usize>,
-}
-
 impl<'a> Field<'a> {
     /// Makes a channel ready. `None` if it has no active voxel or is zero everywhere.
     pub fn new(channel: &'a Channel) -> Option<Self> {
@@ -124,12 +111,25 @@ impl<'a> Field<'a> {
         Some(Field {
             channel,
             blocks: BlockStore::new(&channel.tree),
+            map: OnceLock::new(),
             index_from_world: inverse.matrix3,
             offset: inverse.translation - base,
             base_brick,
             brick_box: [min >> 3, max >> 3],
             bounds: [min.as_dvec3() - base, max.as_dvec3() + 1.0 - base],
         })
+    }
+
+    /// A flat map of the field's bricks, unless they are too many.
+    #[inline]
+    pub(crate) fn map(&self) -> Option<&BrickMap> {
+        let [first, last] = self.brick_box;
+        self.map.get_or_init(|| BrickMap::new(&mut Accessor::new(&self.channel.tree), first, last)).as_ref()
+    }
+
+    /// The brick whose first voxel is at a position of the walk.
+    pub(crate) fn brick_at(&self, corner: Vec3) -> IVec3 {
+        (corner * 0.125).as_ivec3().wrapping_add(self.base_brick)
     }
 
     /// What a thread needs to read the field.
@@ -319,36 +319,35 @@ impl Runs<'_, '_> {
     }
 
     /// The next brick or homogeneous part of a tile that is not empty. To be used instead of the iterator.
-    #[inline(always)]
     pub(crate) fn next_brick(&mut self) -> Option<BrickSpan> {
         while self.t < self.t_end {
             let (t0, brick) = (self.t, self.brick);
-            let (bounds, entry) = match self.accessor.place(brick) {
+            let content = match self.accessor.place(brick) {
                 BrickPlace::Entry(entry) => {
                     self.step_brick();
-                    (self.accessor.tree().node4.footprints[entry], Some(entry))
+                    let bounds = self.accessor.tree().node4.footprints[entry];
+                    match u32::try_from(entry) {
+                        Ok(entry) if !bounds.is_constant() => SpanContent::Entry(entry),
+                        _ => SpanContent::Constant(bounds.max),
+                    }
                 }
                 BrickPlace::Zero => {
                     self.step_brick();
                     continue;
                 }
-                BrickPlace::Tile => (self.cross_tile(), None),
+                BrickPlace::Tile => self.cross_tile(),
             };
             let t1 = self.t.min(self.t_end);
-            if bounds.min < bounds.max || bounds.max != 0.0 {
-                if t0 < t1 {
-                    let corner = (brick.wrapping_sub(self.base_brick)).as_vec3() * 8.0;
-                    return Some(BrickSpan { t0, t1, bounds, brick, corner, entry });
-                }
+            if content != SpanContent::Constant(0.0) && t0 < t1 {
+                let corner = brick.wrapping_sub(self.base_brick).as_vec3() * 8.0;
+                return Some(BrickSpan { t0, t1, corner, content });
             }
         }
         None
     }
 
     /// Moves on through a tile as far as it has one value, or by one brick of the layer that blends with the neighbours.
-    /// Returns bounds of what was crossed.
-    #[inline(never)]
-    fn cross_tile(&mut self) -> Bounds {
+    fn cross_tile(&mut self) -> SpanContent {
         let region = self.accessor.region(self.brick);
         let (origin, last) = extent(self.brick, region.log2_bricks);
         if region.footprint.is_constant() {
@@ -356,16 +355,16 @@ impl Runs<'_, '_> {
             if region.footprint.max == 0.0 && region.log2_bricks == LOG2_NODE5_BRICKS {
                 self.leap_to_root_entry();
             }
-            return region.footprint;
+            return SpanContent::Constant(region.footprint.max);
         }
         match region.content {
             Content::Constant(value) if self.brick.cmplt(last).all() => {
                 self.leap_over(origin, last - 1);
-                Bounds::of(value)
+                SpanContent::Constant(value)
             }
             _ => {
                 self.step_brick();
-                region.footprint
+                SpanContent::TileBorder
             }
         }
     }
