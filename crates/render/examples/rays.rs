@@ -10,9 +10,13 @@ use std::error::Error;
 use std::time::Instant;
 
 use glam::{DVec2, DVec3};
+use nuage_pipeline::import::{import, import_surface};
 use nuage_render::camera::{Camera, Ray};
 use nuage_render::depth::{optical_depth, stepped_transmittance};
 use nuage_render::filter::Filter;
+use nuage_render::hash::{hash_pixel, hash_u32, unit_f32};
+use nuage_render::surface::first_hit;
+use nuage_render::track::first_collision;
 use nuage_render::traverse::{Field, Reader};
 use nuage_volume::channel::Channel;
 use rayon::prelude::*;
@@ -22,11 +26,15 @@ const EXTINCTION_PER_VOXEL: f64 = 0.1;
 const STEP_VOXELS: f32 = 0.5;
 const TILE: u32 = 16;
 
-fn channel(path: &str) -> Result<Channel, Box<dyn Error>> {
+/// The channel of a file's first grid, and the value at its surface if it is a level set that is to be drawn.
+fn channel(path: &str, is_surface: bool) -> Result<(Channel, f32), Box<dyn Error>> {
     let bytes = std::fs::read(path)?;
     let file = nuage_vdb::File::open(bytes.as_slice())?;
     let grid = file.read_all()?.into_iter().next().ok_or("the file has no grid")?;
-    Ok(nuage_pipeline::import::import(grid)?.0)
+    Ok(match is_surface {
+        true => import_surface(grid)?,
+        false => (import(grid)?.0, 0.0),
+    })
 }
 
 /// The picture of a kernel, row by row, and how many milliseconds it took.
@@ -73,6 +81,9 @@ fn pixels_of<'r, 'a: 'r>(
     field: &'r Field<'a>,
     ray: impl Fn(u32, u32) -> Ray + Sync + 'r,
     extinction: f32,
+    voxel_size: f64,
+    level: f32,
+    seed: u32,
 ) -> Result<Pixels<'r, 'a>, Box<dyn Error>> {
     Ok(match kernel {
         "nearest" | "trilinear" => {
@@ -87,17 +98,24 @@ fn pixels_of<'r, 'a: 'r>(
                 1.0 - (-extinction * optical_depth(field, reader, &ray(x, y), filter)).exp()
             })
         }
-        "count" => Box::new(move |reader, x, y| {
-            let r = ray(x, y);
-            let Some([a, b]) = field.interval(&r) else { return 0.0 };
-            let local = field.local(&r, a);
-            let mut runs = field.runs(&mut reader.walker, local, 0.0, (b - a) as f32);
-            let mut n = 0;
-            while runs.next_segment().is_some() {
-                n += 1;
-            }
-            n as f32
+        "track" => Box::new(move |reader, x, y| {
+            let (path, mut count) = (hash_pixel(x, y, 0, hash_u32(seed)), 0_u32);
+            let random = || {
+                count += 1;
+                unit_f32(hash_u32(path.wrapping_add(count)))
+            };
+            f32::from(first_collision(field, reader, &ray(x, y), extinction, random).is_some())
         }),
+        "surface" | "surface-shaded" => {
+            let is_shaded = kernel == "surface-shaded";
+            Box::new(move |reader, x, y| {
+                let ray = ray(x, y);
+                first_hit(field, reader, &ray, level).map_or(0.0, |hit| match is_shaded {
+                    true => hit.normal.dot(ray.direction.as_vec3()).abs(),
+                    false => (hit.distance / voxel_size) as f32,
+                })
+            })
+        }
         _ => return Err(format!("no kernel '{kernel}'").into()),
     })
 }
@@ -109,8 +127,8 @@ fn main() -> Result<(), Box<dyn Error>> {
     };
     let repeats: usize = repeats.parse()?;
     let size: u32 = rest.first().map_or(Ok(1024), |size| size.parse())?;
-    let _seed: u32 = rest.get(2).map_or(Ok(0), |seed| seed.parse())?;
-    let channel = channel(path)?;
+    let seed: u32 = rest.get(2).map_or(Ok(0), |seed| seed.parse())?;
+    let (channel, level) = channel(path, kernel.starts_with("surface"))?;
     let field = Field::new(&channel).ok_or("the grid is empty")?;
     let active = channel.active_box.ok_or("the grid is empty")?;
     let (low, extent) = (active.min.as_dvec3(), (active.max - active.min + 1).as_dvec3());
@@ -125,7 +143,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let ray = |x: u32, y: u32| -> Ray {
         camera.ray(DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5), size, size)
     };
-    let pixel = pixels_of(kernel, &field, ray, extinction)?;
+    let pixel = pixels_of(kernel, &field, ray, extinction, voxel_size, level, seed)?;
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads.parse()?).build()?;
     let (mut times, mut cpu_times) = (Vec::new(), Vec::new());
     let mut tiles = Vec::new();

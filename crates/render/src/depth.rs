@@ -14,11 +14,11 @@ use crate::blocks::{Block, Blocks, SIDE};
 use crate::camera::Ray;
 use crate::filter::Filter;
 use crate::simd::level;
-use crate::traverse::{Field, LocalRay, Reader, floor};
-use crate::walk::{BrickSpan, MapWalk, SpanContent, Spans};
+use crate::traverse::{Field, LocalRay, Reader};
+use crate::walk::{BrickSpan, Faces, MapWalk, SpanContent, Spans};
 
-/// The values of a brick lie at less than this, in voxels from its first corner.
-const BRICK_END: f32 = 7.999_999_5;
+/// The cells of a brick lie at less than this, in voxels from its first corner.
+const LAST_CELL_END: f32 = 7.999_999_5;
 
 /// The integral of a field along a ray from its origin on, in values times world lengths. Times the extinction of density 1 it
 /// is the optical depth.
@@ -80,7 +80,7 @@ pub(crate) fn stepped_transmittance_at<'a>(
 
 /// The ray of a filter: voxels of the nearest filter begin half a voxel before their place, cells at it.
 #[inline(always)]
-fn filter_ray<const NEAREST: bool>(ray: LocalRay) -> LocalRay {
+pub(crate) fn filter_ray<const NEAREST: bool>(ray: LocalRay) -> LocalRay {
     match NEAREST {
         true => LocalRay::new(ray.origin + 0.5, ray.direction),
         false => ray,
@@ -128,13 +128,13 @@ fn step_spans<'a, S: Simd, const NEAREST: bool>(
     let per_step = 1.0 / step;
     let loss = extinction * step;
     let lanes = f32x8::simd_from(simd, [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0]);
-    let mut passes = f32x8::splat(simd, 1.0);
+    let (mut passes, mut passes_constant) = (f32x8::splat(simd, 1.0), 1.0);
     while let Some(span) = spans.next_span() {
         let (first, end) = ((span.t0 * per_step).ceil(), (span.t1 * per_step).ceil());
         let block = match block_of(field, blocks, &span) {
             Ok(block) => block,
             Err(value) => {
-                passes[0] *= power(1.0 - loss * value, (end - first) as u32);
+                passes_constant *= power(1.0 - loss * value, (end - first) as u32);
                 continue;
             }
         };
@@ -142,15 +142,14 @@ fn step_spans<'a, S: Simd, const NEAREST: bool>(
         let mut sample = first;
         while sample < end {
             let number = lanes + sample;
-            let value = brick.sample::<NEAREST>(block, number * step);
-            let factor = f32x8::splat(simd, 1.0) - value * loss;
-            let factor = number.simd_lt(f32x8::splat(simd, end)).select(factor, f32x8::splat(simd, 1.0));
-            passes *= factor;
+            let value = brick.sample::<NEAREST>(block, (number * step).min(span.t1));
+            let value = number.simd_lt(f32x8::splat(simd, end)).select(value, f32x8::splat(simd, 0.0));
+            passes *= f32x8::splat(simd, 1.0) - value * loss;
             sample += 8.0;
         }
     }
     let [a, b, c, d, e, f, g, h] = passes.to_array();
-    ((a * b) * (c * d)) * ((e * f) * (g * h))
+    passes_constant * (((a * b) * (c * d)) * ((e * f) * (g * h)))
 }
 
 #[inline(always)]
@@ -184,17 +183,17 @@ fn integrate_spans<'a, S: Simd, const NEAREST: bool>(
     local: &LocalRay,
     mut spans: impl Spans,
 ) -> f32 {
-    let mut depth = f32x8::splat(simd, 0.0);
+    let (mut depth, mut depth_constant) = (f32x8::splat(simd, 0.0), 0.0);
     while let Some(span) = spans.next_span() {
         let block = match block_of(field, blocks, &span) {
             Ok(block) => block,
             Err(value) => {
-                depth[0] += value * (span.t1 - span.t0);
+                depth_constant += value * (span.t1 - span.t0);
                 continue;
             }
         };
         let brick = BrickRay::new(simd, local, &span);
-        let crossings = Crossings::of(local, &span);
+        let crossings = Crossings::of(simd, local, &span);
         let mut cell = 0;
         while cell < crossings.cells {
             let t0 = f32x8::from_slice(simd, &crossings.t[cell..cell + 8]);
@@ -207,12 +206,12 @@ fn integrate_spans<'a, S: Simd, const NEAREST: bool>(
         }
     }
     let [a, b, c, d, e, f, g, h] = depth.to_array();
-    ((a + b) + (c + d)) + ((e + f) + (g + h))
+    depth_constant + (((a + b) + (c + d)) + ((e + f) + (g + h)))
 }
 
 /// The values of the brick of a span, or the one value that it has.
 #[inline(always)]
-fn block_of<'b, 'a>(
+pub(crate) fn block_of<'b, 'a>(
     field: &Field<'a>,
     blocks: &'b mut Blocks<'a>,
     span: &BrickSpan,
@@ -238,11 +237,11 @@ fn power(mut x: f32, mut exponent: u32) -> f32 {
 }
 
 /// Where a ray crosses the faces of voxels in a brick.
-struct Crossings {
+pub(crate) struct Crossings {
     /// Both ends of the span and the crossings between, ascending; behind them the end again.
-    t: [f32; Crossings::MOST + 8],
+    pub(crate) t: [f32; Crossings::MOST + 8],
     /// The number of stretches.
-    cells: usize,
+    pub(crate) cells: usize,
 }
 
 impl Crossings {
@@ -250,43 +249,76 @@ impl Crossings {
     const MOST: usize = 32;
 
     #[inline(always)]
-    fn of(ray: &LocalRay, span: &BrickSpan) -> Crossings {
+    pub(crate) fn of<S: Simd>(simd: S, ray: &LocalRay, span: &BrickSpan) -> Crossings {
         let origin = ray.origin - span.corner;
         let entry = origin + ray.direction * span.t0;
         let next = |entry: f32, origin: f32, direction: f32, inverse: f32| {
-            let cell = floor(entry).clamp(0, 7);
+            // Truncation: an entry is not below 0 but for rounding.
+            let cell = (entry as i32).clamp(0, 7);
             let face = cell + i32::from(direction >= 0.0);
             match direction == 0.0 {
                 true => f32::INFINITY,
                 false => (face as f32 - origin) * inverse,
             }
         };
-        let inverse = ray.inverse();
-        let mut x = next(entry.x, origin.x, ray.direction.x, inverse.x);
-        let mut y = next(entry.y, origin.y, ray.direction.y, inverse.y);
-        let mut z = next(entry.z, origin.z, ray.direction.z, inverse.z);
-        let step = inverse.abs();
+        let (inverse, step) = (ray.inverse(), ray.inverse().abs());
+        let x = next(entry.x, origin.x, ray.direction.x, inverse.x);
+        let y = next(entry.y, origin.y, ray.direction.y, inverse.y);
+        let z = next(entry.z, origin.z, ray.direction.z, inverse.z);
+        let mut faces = Faces::new(simd, [x, y, z], step);
         let mut t = [span.t1; Crossings::MOST + 8];
         t[0] = span.t0;
         let mut cells = 1;
         while cells < Crossings::MOST {
-            let yz = if y < z { y } else { z };
-            let nearest = if x < yz { x } else { yz };
+            let nearest = faces.pass().0;
             if nearest >= span.t1 {
                 break;
             }
             t[cells] = if nearest > span.t0 { nearest } else { span.t0 };
             cells += 1;
-            x += if x == nearest { step.x } else { 0.0 };
-            y += if y == nearest { step.y } else { 0.0 };
-            z += if z == nearest { step.z } else { 0.0 };
         }
         Crossings { t, cells }
     }
 }
 
+/// What stands where a block has no value, should rounding lead there.
+const NOWHERE: [f32; CORNERS_SPAN] = [0.0; CORNERS_SPAN];
+
+/// The eight corners of a cell lie in as many consecutive values of a block: one bounds check.
+const CORNERS_SPAN: usize = SIDE * SIDE + SIDE + 2;
+
+/// The values from the first to the last corner of the cell at an offset of a block.
+#[inline(always)]
+fn corners_from(block: &Block, offset: usize) -> &[f32; CORNERS_SPAN] {
+    match block.get(offset..).and_then(|values| values.first_chunk()) {
+        Some(values) => values,
+        None => &NOWHERE,
+    }
+}
+
+/// The eight corners of a cell, whose coordinates in the brick are whole numbers from 0 to 7: corner `i` at
+/// `dx << 2 | dy << 1 | dz`.
+#[inline(always)]
+pub(crate) fn corners_at(block: &Block, cell: Vec3) -> [f32; 8] {
+    let offset = (cell.x as i32 * 81 + cell.y as i32 * 9 + cell.z as i32) as usize;
+    let v = corners_from(block, offset);
+    [v[0], v[1], v[9], v[10], v[81], v[82], v[90], v[91]]
+}
+
+/// The interpolation at a position in a brick: what each lane of [`BrickRay::sample`] does.
+#[inline(always)]
+pub(crate) fn interpolate(block: &Block, position: Vec3) -> f32 {
+    let position = position.min(Vec3::splat(LAST_CELL_END));
+    let cell = Vec3::new(position.x as i32 as f32, position.y as i32 as f32, position.z as i32 as f32);
+    let ([x, y, z], c) = ((position - cell).to_array(), corners_at(block, cell));
+    let mix = |a: f32, b: f32, t: f32| a + (b - a) * t;
+    let low = mix(mix(c[0], c[1], z), mix(c[2], c[3], z), y);
+    let high = mix(mix(c[4], c[5], z), mix(c[6], c[7], z), y);
+    mix(low, high, x)
+}
+
 /// A ray in voxels from the first corner of a brick, in each lane.
-struct BrickRay<S: Simd> {
+pub(crate) struct BrickRay<S: Simd> {
     simd: S,
     origin: Vec3,
     direction: Vec3,
@@ -294,15 +326,17 @@ struct BrickRay<S: Simd> {
 
 impl<S: Simd> BrickRay<S> {
     #[inline(always)]
-    fn new(simd: S, ray: &LocalRay, span: &BrickSpan) -> Self {
+    pub(crate) fn new(simd: S, ray: &LocalRay, span: &BrickSpan) -> Self {
         BrickRay { simd, origin: ray.origin - span.corner, direction: ray.direction }
     }
 
-    /// The cells and the fractions inside them.
+    /// The cells and the fractions inside them. Rounding may put a point a little outside of the brick: below it, the
+    /// conversion to a whole number brings it back; above it, there is a voxel, but no cell.
     #[inline(always)]
-    fn cells(&self, t: f32x8<S>) -> ([i32; 8], [f32x8<S>; 3]) {
+    fn cells<const NEAREST: bool>(&self, t: f32x8<S>) -> ([i32; 8], [f32x8<S>; 3]) {
         let axis = |origin: f32, direction: f32| {
-            let p = (t * direction + origin).max(0.0).min(BRICK_END);
+            let p = t * direction + origin;
+            let p = if NEAREST { p } else { p.min(LAST_CELL_END) };
             let cell = p.to_int::<i32x8<S>>();
             (cell, p - cell.to_float::<f32x8<S>>())
         };
@@ -315,10 +349,12 @@ impl<S: Simd> BrickRay<S> {
 
     /// The values at `t`.
     #[inline(always)]
-    fn sample<const NEAREST: bool>(&self, block: &Block, t: f32x8<S>) -> f32x8<S> {
-        let (offsets, [x, y, z]) = self.cells(t);
+    pub(crate) fn sample<const NEAREST: bool>(&self, block: &Block, t: f32x8<S>) -> f32x8<S> {
+        let (offsets, [x, y, z]) = self.cells::<NEAREST>(t);
         if NEAREST {
-            return f32x8::from_fn(self.simd, |lane| block[offsets[lane] as usize]);
+            return f32x8::from_fn(self.simd, |lane| {
+                block.get(offsets[lane] as usize).copied().unwrap_or(0.0)
+            });
         }
         let c = self.corners(block, offsets);
         let mix = |a: f32x8<S>, b: f32x8<S>, t: f32x8<S>| a + (b - a) * t;
@@ -330,12 +366,8 @@ impl<S: Simd> BrickRay<S> {
     /// The eight corners of the cell in each lane, corner `i` at `dx << 2 | dy << 1 | dz`.
     #[inline(always)]
     fn corners(&self, block: &Block, offsets: [i32; 8]) -> [f32x8<S>; 8] {
-        const LAST: usize = SIDE * SIDE + SIDE + 2;
-        // The eight corners lie in 92 consecutive values: one bounds check for each lane.
-        let cells: [&[f32; LAST]; 8] = std::array::from_fn(|lane| {
-            let offset = offsets[lane] as usize;
-            block[offset..offset + LAST].try_into().expect("as many values")
-        });
+        let cells: [&[f32; CORNERS_SPAN]; 8] =
+            std::array::from_fn(|lane| corners_from(block, offsets[lane] as usize));
         let corner = |at: usize| f32x8::from_fn(self.simd, |lane| cells[lane][at]);
         [corner(0), corner(1), corner(9), corner(10), corner(81), corner(82), corner(90), corner(91)]
     }
@@ -347,7 +379,7 @@ impl<S: Simd> BrickRay<S> {
     /// `xyz` over a line through `m` is `mx my mz + (mx dy dz + my dx dz + mz dx dy) / 12`, and likewise for `xy`.
     #[inline(always)]
     fn integral(&self, block: &Block, t0: f32x8<S>, t1: f32x8<S>) -> f32x8<S> {
-        let (offsets, [x, y, z]) = self.cells((t0 + t1) * 0.5);
+        let (offsets, [x, y, z]) = self.cells::<false>((t0 + t1) * 0.5);
         let c = self.corners(block, offsets);
         let length = t1 - t0;
         let [dx, dy, dz] = self.direction.to_array().map(|direction| length * direction);

@@ -29,5 +29,8 @@ pub mod phase;
 pub mod picture;
 pub mod scene;
 mod simd;
+pub mod surface;
+pub mod track;
 pub mod traverse;
+pub mod views;
 mod walk;

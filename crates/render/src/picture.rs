@@ -98,7 +98,7 @@ pub fn trace<'s>(
 }
 
 /// What `pixel` makes of each pixel, row by row, on all cores. Each thread has a worker of its own.
-fn each_pixel<W, P: Copy + Default + Send>(
+pub(crate) fn each_pixel<W, P: Copy + Default + Send>(
     [width, height]: [u32; 2],
     worker: impl Fn() -> W + Sync + Send,
     pixel: impl Fn(&mut W, u32, u32) -> P + Sync + Send,

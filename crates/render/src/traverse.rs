@@ -14,7 +14,7 @@ use glam::{DMat3, DVec3, IVec3, Mat3, Vec3};
 use nuage_volume::accessor::{Accessor, BrickPlace};
 use nuage_volume::channel::Channel;
 use nuage_volume::space::LOG2_NODE5_BRICKS;
-use nuage_volume::tree::Content;
+use nuage_volume::tree::{Content, Tree};
 
 use crate::blocks::{BlockStore, Blocks};
 use crate::camera::Ray;
@@ -130,6 +130,32 @@ impl<'a> Field<'a> {
     /// The brick whose first voxel is at a position of the walk.
     pub(crate) fn brick_at(&self, corner: Vec3) -> IVec3 {
         (corner * 0.125).as_ivec3().wrapping_add(self.base_brick)
+    }
+
+    /// The tree of the channel.
+    #[inline(always)]
+    pub(crate) fn tree(&self) -> &'a Tree {
+        &self.channel.tree
+    }
+
+    /// The voxel whose place is a position of the walk.
+    pub(crate) fn voxel_at(&self, place: Vec3) -> IVec3 {
+        place.as_ivec3().wrapping_add(self.base_brick << 3)
+    }
+
+    /// The first voxel of the active box, and its size.
+    pub(crate) fn voxel_box(&self) -> [DVec3; 2] {
+        let size = self.bounds[1] - self.bounds[0] - 1.0;
+        [self.bounds[0] + 1.0 + self.base_brick.as_dvec3() * 8.0, size]
+    }
+
+    /// The corners, in the world, of the box of all voxels other than zero.
+    pub(crate) fn world_corners(&self) -> [DVec3; 8] {
+        let [first, size] = self.voxel_box();
+        std::array::from_fn(|i| {
+            let corner = DVec3::new((i >> 2) as f64, (i >> 1 & 1) as f64, (i & 1) as f64);
+            self.channel.world_from_index.transform_point3(first - 0.5 + corner * size)
+        })
     }
 
     /// What a thread needs to read the field.

@@ -5,7 +5,7 @@
 //! Sheffer, "Proximity Clouds – an Acceleration Technique for 3D Grid Traversal", 1994). A field whose box is too large for one
 //! is walked by its tree; both give the same [`BrickSpan`]s.
 
-use fearless_simd::{Simd, f32x4, i32x4, prelude::*};
+use fearless_simd::{Simd, f32x4, i32x4, mask32x4, prelude::*};
 use glam::{IVec3, Vec3};
 use nuage_volume::accessor::{Accessor, BrickPlace};
 use nuage_volume::brick::Bounds;
@@ -17,7 +17,7 @@ use crate::traverse::{Field, LocalRay, Runs, floor};
 const MOST_CELLS: i64 = 1 << 22;
 
 /// A ray leaps where this many layers of bricks around it are empty; where there are fewer, steps are faster.
-const LEAST_LEAP: u32 = 3;
+const LEAST_LEAP: u32 = 5;
 
 /// Cells of a map from here on have no entry to be read.
 const NO_ENTRY: u32 = 0xffff_fe00;
@@ -104,6 +104,11 @@ impl BrickMap {
         }
         Some(BrickMap { cells: cells.into(), size })
     }
+
+    /// How far apart neighbours along each axis are.
+    fn strides(&self) -> IVec3 {
+        IVec3::new(self.size.y * self.size.z, self.size.z, 1)
+    }
 }
 
 /// What a map says of a brick.
@@ -150,6 +155,39 @@ fn chessboard_distances(distances: &mut [u8], size: IVec3) {
     sweep(slice, x, &|line| line, y * z);
 }
 
+/// The faces of a lattice that a ray is about to cross, one for each axis.
+pub(crate) struct Faces<S: Simd> {
+    /// Where the ray crosses them; the last lane is never.
+    next: f32x4<S>,
+    /// From face to face.
+    spacing: f32x4<S>,
+}
+
+impl<S: Simd> Faces<S> {
+    #[inline(always)]
+    pub(crate) fn new(simd: S, next: [f32; 3], spacing: Vec3) -> Self {
+        let spacing = [spacing.x, spacing.y, spacing.z, 0.0];
+        Faces { next: Self::lanes(simd, next), spacing: f32x4::simd_from(simd, spacing) }
+    }
+
+    #[inline(always)]
+    fn lanes(simd: S, [x, y, z]: [f32; 3]) -> f32x4<S> {
+        f32x4::simd_from(simd, [x, y, z, f32::INFINITY])
+    }
+
+    /// Goes through the nearest face, or through several that meet in an edge. Returns where, and along which axes.
+    #[inline(always)]
+    pub(crate) fn pass(&mut self) -> (f32, mask32x4<S>) {
+        // Floats that are not negative are ordered as their bits are, and integers take fewer cycles.
+        let bits = self.next.bitcast::<i32x4<S>>();
+        let nearest = bits.min(bits.rotate_elements_left::<1>());
+        let nearest = nearest.min(nearest.rotate_elements_left::<2>());
+        let axes = bits.simd_eq(nearest);
+        self.next = axes.select(self.next + self.spacing, self.next);
+        (f32::from_bits(nearest[0] as u32), axes)
+    }
+}
+
 /// A ray on its way through a [`BrickMap`].
 pub(crate) struct MapWalk<'w, 'a, S: Simd> {
     simd: S,
@@ -159,24 +197,21 @@ pub(crate) struct MapWalk<'w, 'a, S: Simd> {
     ray: LocalRay,
     t: f32,
     t_end: f32,
-    /// Where the ray leaves the brick along each axis; the last lane is never.
-    next: f32x4<S>,
-    /// From brick to brick, along each axis.
-    per_brick: f32x4<S>,
+    faces: Faces<S>,
     /// The first voxel of the brick.
     corner: f32x4<S>,
     corner_step: f32x4<S>,
-    cell: usize,
-    /// How far apart cells are in the map, for each set of axes that a step may go along.
-    strides: [usize; 8],
+    /// The place of the brick in the map: what each axis adds to it, and from brick to brick.
+    cell: i32x4<S>,
+    stride: i32x4<S>,
 }
 
 /// Where a walk stands.
 #[derive(Clone, Copy)]
 struct Place {
-    next: [f32; 4],
+    next: [f32; 3],
     corner: [f32; 4],
-    cell: usize,
+    cell: [i32; 4],
 }
 
 impl<'w, 'a, S: Simd> MapWalk<'w, 'a, S> {
@@ -195,12 +230,7 @@ impl<'w, 'a, S: Simd> MapWalk<'w, 'a, S> {
         let brick = IVec3::new(floor(position.x), floor(position.y), floor(position.z));
         let place = Place::of(map, &ray, brick.clamp(IVec3::ONE, map.size - 2));
         let sign = IVec3::select(ray.direction.cmpge(Vec3::ZERO), IVec3::ONE, IVec3::NEG_ONE);
-        let stride = IVec3::new(map.size.y * map.size.z, map.size.z, 1) * sign;
-        let strides = std::array::from_fn(|axes| {
-            let along = |axis: usize, stride: i32| if axes >> axis & 1 == 1 { stride } else { 0 };
-            (along(0, stride.x) + along(1, stride.y) + along(2, stride.z)) as usize
-        });
-        let [dx, dy, dz] = (8.0 * ray.inverse()).abs().to_array();
+        let stride = map.strides() * sign;
         let [x, y, z] = (8.0 * sign.as_vec3()).to_array();
         MapWalk {
             simd,
@@ -210,38 +240,41 @@ impl<'w, 'a, S: Simd> MapWalk<'w, 'a, S> {
             ray,
             t: t0,
             t_end: t1,
-            next: f32x4::simd_from(simd, place.next),
-            per_brick: f32x4::simd_from(simd, [dx, dy, dz, 0.0]),
+            faces: Faces::new(simd, place.next, (8.0 * ray.inverse()).abs()),
             corner: f32x4::simd_from(simd, place.corner),
             corner_step: f32x4::simd_from(simd, [x, y, z, 0.0]),
-            cell: place.cell,
-            strides,
+            cell: i32x4::simd_from(simd, place.cell),
+            stride: i32x4::simd_from(simd, [stride.x, stride.y, stride.z, 0]),
         }
     }
 
     /// Moves on to the next brick, or diagonally through an edge.
     #[inline(always)]
     fn step(&mut self) {
-        // Floats that are not negative are ordered as their bits are, and integers take fewer cycles.
-        let bits = self.next.bitcast::<i32x4<S>>();
-        let nearest = bits.min(bits.rotate_elements_left::<1>());
-        let nearest = nearest.min(nearest.rotate_elements_left::<2>());
-        let axes = bits.simd_eq(nearest);
-        self.next = axes.select(self.next + self.per_brick, self.next);
+        let (t, axes) = self.faces.pass();
         self.corner += axes.select(self.corner_step, f32x4::splat(self.simd, 0.0));
-        self.cell = self.cell.wrapping_add(self.strides[axes.to_bitmask() as usize & 7]);
-        let t = f32::from_bits(nearest[0] as u32);
+        self.cell += axes.select(self.stride, i32x4::splat(self.simd, 0));
         self.t = if t > self.t { t } else { self.t };
     }
 
     /// Moves on to where the ray leaves the bricks that are at most `reach` away.
     #[inline(always)]
     fn leap(&mut self, reach: [IVec3; 2]) {
-        let (t, place) = Place::behind(self.map, &self.ray, self.corner.to_array(), reach);
+        // A copy: what a call might change through a reference, the compiler keeps in memory.
+        let ray = self.ray;
+        let (t, place) = Place::behind(self.map, &ray, self.corner.to_array(), reach);
         self.t = if t > self.t { t } else { self.t };
-        self.next = f32x4::simd_from(self.simd, place.next);
+        self.faces.next = Faces::lanes(self.simd, place.next);
         self.corner = f32x4::simd_from(self.simd, place.corner);
-        self.cell = place.cell;
+        self.cell = i32x4::simd_from(self.simd, place.cell);
+    }
+
+    /// What the map says of the brick.
+    #[inline(always)]
+    fn read(&self) -> Option<u32> {
+        let pairs = self.cell + self.cell.rotate_elements_left::<1>();
+        let all = pairs + pairs.rotate_elements_left::<2>();
+        self.map.cells.get(all[0] as usize).copied()
     }
 }
 
@@ -252,10 +285,11 @@ impl Place {
         let far = Vec3::select(ray.direction.cmpge(Vec3::ZERO), corner + 8.0, corner);
         let t = (far - ray.origin) * ray.inverse();
         let t = Vec3::select(ray.direction.cmpeq(Vec3::ZERO), Vec3::INFINITY, t);
+        let cell = brick * map.strides();
         Place {
-            next: [t.x, t.y, t.z, f32::INFINITY],
+            next: t.to_array(),
             corner: [corner.x, corner.y, corner.z, 0.0],
-            cell: ((brick.x * map.size.y + brick.y) * map.size.z + brick.z) as usize,
+            cell: [cell.x, cell.y, cell.z, 0],
         }
     }
 
@@ -288,7 +322,7 @@ impl<S: Simd> Spans for MapWalk<'_, '_, S> {
     fn next_span(&mut self) -> Option<BrickSpan> {
         while self.t < self.t_end {
             let (t0, corner) = (self.t, self.corner);
-            let cell = *self.map.cells.get(self.cell)?;
+            let cell = self.read()?;
             if cell >= EMPTY {
                 let distance = cell - EMPTY;
                 match distance >= LEAST_LEAP {
