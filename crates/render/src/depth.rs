@@ -78,6 +78,12 @@ pub(crate) fn stepped_transmittance_at<'a>(
     ))
 }
 
+/// Where a ray enters and leaves the field, as a filter sees it.
+#[inline(always)]
+pub(crate) fn filter_interval<const NEAREST: bool>(field: &Field<'_>, ray: &Ray) -> Option<[f64; 2]> {
+    field.interval_of(ray, if NEAREST { 0.5 } else { 0.0 })
+}
+
 /// The ray of a filter: voxels of the nearest filter begin half a voxel before their place, cells at it.
 #[inline(always)]
 pub(crate) fn filter_ray<const NEAREST: bool>(ray: LocalRay) -> LocalRay {
@@ -96,7 +102,7 @@ fn stepped_on<'a, S: Simd, const NEAREST: bool>(
     step_voxels: f32,
     extinction: f32,
 ) -> f32 {
-    let Some([start, end]) = field.interval(ray) else { return 1.0 };
+    let Some([start, end]) = filter_interval::<NEAREST>(field, ray) else { return 1.0 };
     let step = f64::from(step_voxels) / field.voxels_per_length(ray);
     // t = 0 is the first sample in the field.
     let start = (start / step).ceil() * step;
@@ -159,7 +165,7 @@ fn optical_depth_on<'a, S: Simd, const NEAREST: bool>(
     reader: &mut Reader<'a>,
     ray: &Ray,
 ) -> f32 {
-    let Some([start, end]) = field.interval(ray) else { return 0.0 };
+    let Some([start, end]) = filter_interval::<NEAREST>(field, ray) else { return 0.0 };
     let local = filter_ray::<NEAREST>(field.local(ray, start));
     let length = (end - start) as f32;
     let Reader { walker, blocks, .. } = reader;
@@ -395,5 +401,113 @@ impl<S: Simd> BrickRay<S> {
         let xy = y1 - y0;
         let mixed = xy * (dx * dy) + xz * (dx * dz) + yz * (dy * dz);
         (value + mixed * (1.0 / 12.0)) * length
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::{DAffine3, DVec3, IVec3};
+    use nuage_volume::brick::{BrickSummary, Bricks};
+    use nuage_volume::build::{TileSize, TreeBuilder};
+    use nuage_volume::channel::{Channel, IndexBox};
+    use nuage_volume::space::BRICK_VOXELS;
+
+    use super::*;
+    use crate::hash::{hash_u32, unit_f32};
+
+    fn random(seed: u32) -> f32 {
+        unit_f32(hash_u32(seed))
+    }
+
+    /// Bricks here and there, some of one value, and a large tile beside them.
+    fn channel() -> Channel {
+        let mut builder = TreeBuilder::new();
+        let mut all = Vec::new();
+        builder.tile(IVec3::new(16, 0, 0), TileSize::Node4, 0.4).unwrap();
+        for i in 0..300 {
+            let brick = [1, 2, 3].map(|j| (random(i * 5 + j) * 16.0) as i32);
+            let brick = IVec3::from_array(brick);
+            let values: [f32; BRICK_VOXELS] = std::array::from_fn(|j| random(i * 512 + j as u32));
+            // Places that are taken already are left as they are.
+            if i % 9 == 0 {
+                let _ = builder.tile(brick, TileSize::Brick, 0.7);
+            } else if builder.brick(brick, BrickSummary::of(&values)).is_ok() {
+                all.extend(values);
+            }
+        }
+        let tree = builder.finish(Bricks::F32(all)).unwrap();
+        let active_box = Some(IndexBox { min: IVec3::ZERO, max: IVec3::new(255, 127, 127) });
+        Channel { tree, world_from_index: DAffine3::from_scale(DVec3::splat(0.1)), active_box }
+    }
+
+    fn rays() -> impl Iterator<Item = Ray> {
+        (0..200).map(|i| {
+            let point = |seed: u32| {
+                let [x, y, z] = [1, 2, 3].map(|j| f64::from(random(seed + j)));
+                DVec3::new(x * 26.0, y * 13.0, z * 13.0)
+            };
+            let (from, to) = (point(i * 50 + 7), point(i * 50 + 20));
+            let direction =
+                if i % 5 == 0 { DVec3::AXES[i as usize / 5 % 3] } else { (to - from).normalize() };
+            Ray { origin: from - direction * 40.0, direction }
+        })
+    }
+
+    #[test]
+    fn all_levels_give_the_same_bits() {
+        let channel = channel();
+        let field = Field::new(&channel).unwrap();
+        let mut reader = field.reader();
+        for ray in rays() {
+            for filter in [Filter::Nearest, Filter::Trilinear] {
+                let mut both = |level| {
+                    let depth = optical_depth_at(level, &field, &mut reader, &ray, filter);
+                    let passes = stepped_transmittance_at(level, &field, &mut reader, &ray, filter, 0.5, 0.3);
+                    [depth.to_bits(), passes.to_bits()]
+                };
+                assert_eq!(both(Level::baseline()), both(Level::new()), "{ray:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn the_map_and_the_tree_lead_the_same_way() {
+        let channel = channel();
+        let field = Field::new(&channel).unwrap();
+        let by_tree = Field::new(&channel).unwrap().without_map();
+        let (mut reader, mut tree_reader) = (field.reader(), by_tree.reader());
+        assert!(field.map().is_some() && by_tree.map().is_none());
+        let mut sum = 0.0;
+        for ray in rays() {
+            for filter in [Filter::Nearest, Filter::Trilinear] {
+                let a = optical_depth(&field, &mut reader, &ray, filter);
+                let b = optical_depth(&by_tree, &mut tree_reader, &ray, filter);
+                assert!((a - b).abs() < 3e-5 * (1.0 + a), "{ray:?}: {a} and {b}");
+                let step =
+                    |field, reader: &mut _| stepped_transmittance(field, reader, &ray, filter, 0.5, 0.3);
+                let (a, b) = (step(&field, &mut reader), step(&by_tree, &mut tree_reader));
+                // A sample at the very face of a brick may fall to either side.
+                assert!((a - b).abs() < 0.02, "{ray:?}: {a} and {b}");
+                sum += a;
+            }
+        }
+        assert!(sum > 10.0 && sum < 390.0, "{sum}");
+    }
+
+    #[test]
+    fn lanes_do_what_the_scalar_code_does() {
+        let block: Block = std::array::from_fn(|i| random(i as u32));
+        for i in 0..500 {
+            let [x, y, z] = [1, 2, 3].map(|j| random(i * 3 + j) * 8.0);
+            let at = Vec3::new(x, y, z);
+            let ray = LocalRay::new(at, Vec3::new(0.1, -0.3, 0.2));
+            let content = SpanContent::TileBorder;
+            let span = BrickSpan { t0: 0.0, t1: 1.0, corner: Vec3::ZERO, content };
+            let lanes = dispatch!(level(), simd => simd.vectorize(
+                #[inline(always)]
+                || BrickRay::new(simd, &ray, &span).sample::<false>(&block, f32x8::splat(simd, 0.0)).to_array()
+            ));
+            assert_eq!(lanes, [interpolate(&block, at); 8]);
+        }
     }
 }

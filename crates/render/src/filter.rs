@@ -141,7 +141,8 @@ mod tests {
         let bend = |x: f32| (along(x - 0.125) - 2.0 * along(x) + along(x + 0.125)) * 64.0;
         let linear = |x: f32| f64::from(trilinear(Vec3::new(x, 0.3, 0.6), noise));
         let linear_bend = |x: f32| (linear(x - 0.125) - 2.0 * linear(x) + linear(x + 0.125)) * 64.0;
-        let jump = |bend: &dyn Fn(f32) -> f64, x: f32| (bend(x) - 0.5 * (bend(x - 0.25) + bend(x + 0.25))).abs();
+        let jump =
+            |bend: &dyn Fn(f32) -> f64, x: f32| (bend(x) - 0.5 * (bend(x - 0.25) + bend(x + 0.25))).abs();
         let largest = |bend: &dyn Fn(f32) -> f64| (0..20).map(|i| jump(bend, i as f32)).fold(0.0, f64::max);
         assert!(largest(&bend) < 0.25, "{}", largest(&bend));
         assert!(largest(&linear_bend) > 1.0, "{}", largest(&linear_bend));

@@ -8,7 +8,7 @@ use glam::{IVec3, Vec3};
 
 use crate::blocks::{Block, Blocks};
 use crate::camera::Ray;
-use crate::depth::{BrickRay, Crossings, block_of, corners_at, filter_ray};
+use crate::depth::{BrickRay, Crossings, block_of, corners_at, filter_interval, filter_ray};
 use crate::simd::level;
 use crate::traverse::{Field, LocalRay, Reader};
 use crate::walk::{BrickSpan, MapWalk, SpanContent, Spans};
@@ -76,7 +76,7 @@ pub fn first_voxel<'a>(
     ray: &Ray,
     above: f32,
 ) -> Option<VoxelHit> {
-    let [start, end] = field.interval(ray)?;
+    let [start, end] = filter_interval::<true>(field, ray)?;
     let local = filter_ray::<true>(field.local(ray, start));
     let length = (end - start) as f32;
     let Reader { walker, blocks, .. } = reader;
@@ -122,7 +122,8 @@ fn meet_surface<'a, S: Simd>(
         while cell < crossings.cells {
             // Where cells end, the value is that of the next one too.
             let ends = f32x8::from_slice(simd, &crossings.t[cell + 1..cell + 9]);
-            let reached = brick.sample::<false>(block, ends).simd_ge(f32x8::splat(simd, surface)).to_bitmask();
+            let reached =
+                brick.sample::<false>(block, ends).simd_ge(f32x8::splat(simd, surface)).to_bitmask();
             let first = cell + reached.trailing_zeros() as usize;
             if reached != 0 && first < crossings.cells {
                 let ends = [crossings.t[first], crossings.t[first + 1]];

@@ -132,6 +132,12 @@ impl<'a> Field<'a> {
         (corner * 0.125).as_ivec3().wrapping_add(self.base_brick)
     }
 
+    /// The same field, to be walked by its tree.
+    #[cfg(test)]
+    pub(crate) fn without_map(self) -> Self {
+        Field { map: OnceLock::from(None), ..self }
+    }
+
     /// The tree of the channel.
     #[inline(always)]
     pub(crate) fn tree(&self) -> &'a Tree {
@@ -169,7 +175,12 @@ impl<'a> Field<'a> {
 
     /// Where a ray enters and leaves the field, as distances from its origin.
     pub fn interval(&self, ray: &Ray) -> Option<[f64; 2]> {
-        let origin = self.index_from_world * ray.origin + self.offset;
+        self.interval_of(ray, 0.0)
+    }
+
+    /// The same for a ray that is moved by as many voxels along each axis.
+    pub(crate) fn interval_of(&self, ray: &Ray, shift_voxels: f64) -> Option<[f64; 2]> {
+        let origin = self.index_from_world * ray.origin + self.offset + shift_voxels;
         let direction = self.index_from_world * ray.direction;
         let [mut t0, mut t1] = [0.0f64, f64::INFINITY];
         for axis in 0..3 {

@@ -363,9 +363,7 @@ fn special(field: &Field<'_>, accessor: &mut Accessor<'_>, corner: Vec3) -> (Spa
     let local = brick & (bricks - 1);
     let (below, above) = (local, bricks - 1 - local);
     match region.content {
-        _ if region.footprint.is_constant() => {
-            (SpanContent::Constant(region.footprint.max), [below, above])
-        }
+        _ if region.footprint.is_constant() => (SpanContent::Constant(region.footprint.max), [below, above]),
         Content::Constant(value) if above.cmpgt(IVec3::ZERO).all() => {
             (SpanContent::Constant(value), [below, above - 1])
         }
