@@ -179,22 +179,23 @@ impl<'a> Field<'a> {
     }
 
     /// The same for a ray that is moved by as many voxels along each axis.
+    #[inline]
     pub(crate) fn interval_of(&self, ray: &Ray, shift_voxels: f64) -> Option<[f64; 2]> {
         let origin = self.index_from_world * ray.origin + self.offset + shift_voxels;
         let direction = self.index_from_world * ray.direction;
+        let inverse = direction.recip();
+        let (low, high) = ((self.bounds[0] - origin) * inverse, (self.bounds[1] - origin) * inverse);
+        let (near, far) = (low.min(high), low.max(high));
         let [mut t0, mut t1] = [0.0f64, f64::INFINITY];
         for axis in 0..3 {
-            let (low, high) = (self.bounds[0][axis], self.bounds[1][axis]);
             if direction[axis] == 0.0 {
-                if origin[axis] < low || origin[axis] > high {
+                if origin[axis] < self.bounds[0][axis] || origin[axis] > self.bounds[1][axis] {
                     return None;
                 }
                 continue;
             }
-            let a = (low - origin[axis]) / direction[axis];
-            let b = (high - origin[axis]) / direction[axis];
-            t0 = t0.max(a.min(b));
-            t1 = t1.min(a.max(b));
+            t0 = if near[axis] > t0 { near[axis] } else { t0 };
+            t1 = if far[axis] < t1 { far[axis] } else { t1 };
         }
         (t0 < t1).then_some([t0, t1])
     }
