@@ -49,7 +49,7 @@ done
 psnr() {
   paste <(od -An -v -w4 -t f4 "$1") <(od -An -v -w4 -t f4 "$2") | awk '
     { d = $1 - $2; sum += d * d; if ($2 > peak) peak = $2 }
-    END { printf "%.1f", sum > 0 ? 10 * log(peak * peak * NR / sum) / log(10) : 999 }'
+    END { printf "%.1f", (sum > 0 ? 10 * log(peak * peak * NR / sum) / log(10) : 999) }'
 }
 
 cpu=$(sed -n 's/^model name[^:]*: *//p' /proc/cpuinfo 2>/dev/null | head -n 1)
@@ -93,5 +93,4 @@ compare() {
 for kernel in nearest trilinear exact cubic track; do
   compare "$kernel" "$kernel" "$kernel-spans" "${files[0]}"
 done
-# NanoVDB's faster one does not shade; ours does.
 compare surface-shaded surface-shaded surface-shaded "${files[1]}"
