@@ -109,6 +109,10 @@ enum Meaning {
     LevelSet {
         band: f32,
     },
+    /// Signed distance, kept as such: from 0 outside of the band over `band` at the surface to twice that inside.
+    Surface {
+        band: f32,
+    },
 }
 
 impl Meaning {
@@ -116,11 +120,22 @@ impl Meaning {
         if grid.grid_class() != "level set" {
             return Meaning::Density;
         }
+        Meaning::LevelSet { band: Meaning::band(grid, tree) }
+    }
+
+    fn band(grid: &Grid, tree: &Tree<f32>) -> f32 {
         let background = tree.background.abs();
         let usable = background.is_finite() && background > 0.0;
         // A level set's background is the width of its band: three voxels unless said otherwise.
-        let band = if usable { background } else { 3.0 * grid.transform.voxel_size()[0] as f32 };
-        Meaning::LevelSet { band }
+        if usable { background } else { 3.0 * grid.transform.voxel_size()[0] as f32 }
+    }
+
+    /// A value that becomes 0.
+    fn empty(self) -> f32 {
+        match self {
+            Meaning::Density | Meaning::LevelSet { .. } => 0.0,
+            Meaning::Surface { band } => band,
+        }
     }
 
     fn density(self, value: f32) -> f32 {
@@ -128,6 +143,7 @@ impl Meaning {
             // The comparison is false for NaN.
             Meaning::Density if value > 0.0 => value.min(f32::MAX),
             Meaning::LevelSet { band } if value < 0.0 => (-value / band).min(1.0),
+            Meaning::Surface { band } if value < band => (band - value).min(2.0 * band),
             _ => 0.0,
         }
     }
@@ -137,7 +153,28 @@ impl Meaning {
 ///
 /// # Errors
 /// If the transform is not linear and invertible, or the tree becomes too large.
-pub fn import(mut grid: Grid) -> Result<(Channel, Report), ImportError> {
+pub fn import(grid: Grid) -> Result<(Channel, Report), ImportError> {
+    import_as(grid, Meaning::of)
+}
+
+/// Turns a level set into a channel that is to be drawn as a surface: the distance of the band's outer end, 0 there, twice the
+/// width of the band beyond its inner end. The surface is where it reaches the width, which is returned too.
+///
+/// # Errors
+/// If the transform is not linear and invertible, or the tree becomes too large.
+pub fn import_surface(grid: Grid) -> Result<(Channel, f32), ImportError> {
+    let mut level = 0.0;
+    let (channel, _) = import_as(grid, |grid, tree| {
+        level = Meaning::band(grid, tree);
+        Meaning::Surface { band: level }
+    })?;
+    Ok((channel, level))
+}
+
+fn import_as(
+    mut grid: Grid,
+    meaning: impl FnOnce(&Grid, &Tree<f32>) -> Meaning,
+) -> Result<(Channel, Report), ImportError> {
     let world_from_index = linear_transform(&grid.name, &grid.transform)?;
     let name = grid.name.clone();
     let tree = take_tree(&mut grid)?;
@@ -149,7 +186,7 @@ pub fn import(mut grid: Grid) -> Result<(Channel, Report), ImportError> {
         let tree = TreeBuilder::new().finish(Bricks::F32(Vec::new())).map_err(build_error)?;
         return Ok((Channel { tree, world_from_index, active_box }, Report::default()));
     };
-    let meaning = Meaning::of(&grid, &tree);
+    let meaning = meaning(&grid, &tree);
     let may_be_half = grid.save_float_as_half && matches!(meaning, Meaning::Density);
     let mut importer = Importer {
         meaning,
@@ -272,7 +309,7 @@ impl Importer {
 
     fn tile(&mut self, origin: [i32; 3], size: TileSize, value: f32) -> Result<(), BuildError> {
         let brick = IVec3::from_array(origin) >> 3;
-        if value == 0.0 || self.inside(brick, size).is_none() {
+        if value == self.meaning.empty() || self.inside(brick, size).is_none() {
             return Ok(());
         }
         self.note(value);
@@ -330,7 +367,7 @@ impl Importer {
             return self.builder.brick_again(brick, *index);
         }
         let mut values = [value; BRICK_VOXELS];
-        clear_outside(&mut values, min, max);
+        clear_outside(&mut values, min, max, 0.0);
         self.tile_bricks.extend_from_slice(&values);
         let index = self.builder.brick(brick, BrickSummary::of(&values))?;
         self.placed.insert(key, index);
@@ -416,12 +453,12 @@ fn convert_leaf(
     let inside_min = (clip.min.saturating_sub(origin)).max(IVec3::ZERO);
     let inside_max = (clip.max.saturating_sub(origin)).min(IVec3::splat(7));
     if inside_min != IVec3::ZERO || inside_max != IVec3::splat(7) {
-        clear_outside(values, inside_min, inside_max);
+        clear_outside(values, inside_min, inside_max, meaning.empty());
     }
     let (mut nan, mut negative, mut infinite) = (0, 0, 0);
     // The bits of NaN, negative values and infinities are larger than those of densities; few leaves hold any.
     let largest = values.iter().fold(0, |largest, v| v.to_bits().max(largest));
-    if largest > f32::MAX.to_bits() || matches!(meaning, Meaning::LevelSet { .. }) {
+    if largest > f32::MAX.to_bits() || !matches!(meaning, Meaning::Density) {
         let count = |test: fn(&f32) -> bool| values.iter().filter(|v| test(v)).count() as u16;
         nan = count(|v| v.is_nan());
         if matches!(meaning, Meaning::Density) {
@@ -437,13 +474,13 @@ fn convert_leaf(
     Leaf { summary: BrickSummary::of(values), nan, negative, infinite, exact_in_half }
 }
 
-/// Zeroes the voxels of a brick outside the local box `[min, max]`.
-fn clear_outside(values: &mut [f32; BRICK_VOXELS], min: IVec3, max: IVec3) {
+/// Sets the voxels of a brick outside the local box `[min, max]` to what is empty.
+fn clear_outside(values: &mut [f32; BRICK_VOXELS], min: IVec3, max: IVec3, empty: f32) {
     for (offset, value) in values.iter_mut().enumerate() {
         let offset = offset as i32;
         let local = IVec3::new(offset >> 6, offset >> 3 & 7, offset & 7);
         if local.cmplt(min).any() || local.cmpgt(max).any() {
-            *value = 0.0;
+            *value = empty;
         }
     }
 }

@@ -15,9 +15,10 @@ use nuage_volume::space::brick_of;
 use nuage_volume::tree::{Content, Tree};
 
 /// Voxels of a block per axis.
-const SIDE: usize = 9;
+pub(crate) const SIDE: usize = 9;
 
-type Block = [f32; SIDE * SIDE * SIDE];
+/// The values of a brick and of the layer beyond it, at `(x * 9 + y) * 9 + z`.
+pub(crate) type Block = [f32; SIDE * SIDE * SIDE];
 
 /// The blocks of a tree, by the index of the brick's entry.
 #[derive(Debug, Clone)]
@@ -33,6 +34,8 @@ pub struct Blocks<'a> {
     /// The brick met last, and its place. Its block is there.
     brick: IVec3,
     place: BrickPlace,
+    /// The block of a brick that has no entry, inside a tile, and its place.
+    border: (IVec3, Option<Box<Block>>),
 }
 
 impl BlockStore {
@@ -50,6 +53,7 @@ impl<'a> Blocks<'a> {
             accessor: Accessor::new(tree),
             brick: IVec3::ZERO,
             place: BrickPlace::Tile,
+            border: (IVec3::ZERO, None),
         };
         blocks.meet(IVec3::ZERO);
         blocks
@@ -82,6 +86,30 @@ impl<'a> Blocks<'a> {
         mix(low, high, x)
     }
 
+    /// The block of an entry, whose brick is asked for when the block is made.
+    #[inline(always)]
+    pub(crate) fn of_entry(&mut self, entry: usize, brick: impl Fn() -> IVec3) -> &Block {
+        let slot = &self.store.blocks[entry];
+        match slot.get() {
+            Some(block) => block,
+            None => {
+                let accessor = &mut self.accessor;
+                slot.get_or_init(|| decode_first(accessor, brick()))
+            }
+        }
+    }
+
+    /// The block of a brick that has no entry of its own, being part of a tile.
+    #[cold]
+    pub(crate) fn of_tile(&mut self, brick: IVec3) -> &Block {
+        let (place, block) = &mut self.border;
+        if *place != brick {
+            *block = None;
+        }
+        *place = brick;
+        block.get_or_insert_with(|| decode(&mut self.accessor, brick))
+    }
+
     /// Makes a brick the one met last.
     #[inline(never)]
     fn meet(&mut self, brick: IVec3) {
@@ -92,6 +120,13 @@ impl<'a> Blocks<'a> {
             self.store.blocks[entry].get_or_init(|| decode(accessor, brick));
         }
     }
+}
+
+/// What is done once for each brick need not stand where it is done for each ray.
+#[cold]
+#[inline(never)]
+fn decode_first(accessor: &mut Accessor<'_>, brick: IVec3) -> Box<Block> {
+    decode(accessor, brick)
 }
 
 /// The block of a brick, from it and its seven neighbours.

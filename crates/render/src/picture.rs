@@ -44,18 +44,7 @@ pub fn render<'s>(
         }
         sum.map(|value| value / samples as f32)
     };
-    let tiling = Tiling { width, height };
-    let mut tiles = vec![Vec::new(); tiling.count() as usize];
-    let done = AtomicU32::new(0);
-    each_tile(
-        &mut tiles,
-        || marcher.worker(),
-        |worker, index, tile: &mut Vec<[f32; 4]>| {
-            tile.extend(tiling.pixels(index).map(|[x, y]| pixel(worker, x, y)));
-            progress(done.fetch_add(1, Ordering::Relaxed) + 1, tiling.count());
-        },
-    );
-    image.pixels = tiling.rows(tiles);
+    image.pixels = each_pixel([width, height], || marcher.worker(), pixel, progress);
     Ok(image)
 }
 
@@ -90,6 +79,23 @@ pub fn trace<'s>(
     let tile = |share: f64| progress((share * f64::from(tiles)).round() as u32, tiles);
     progressive::trace(scene, &plan, &mut film, &mut Watch { tile: Some(&tile), ..Watch::default() });
     Ok(Traced { image: film.image(), standard_error: film.map(Tally::standard_error) })
+}
+
+/// What `pixel` makes of each pixel, row by row, on all cores. Each thread has a worker of its own.
+pub(crate) fn each_pixel<W>(
+    [width, height]: [u32; 2],
+    worker: impl Fn() -> W + Sync + Send,
+    pixel: impl Fn(&mut W, u32, u32) -> [f32; 4] + Sync + Send,
+    progress: &(dyn Fn(u32, u32) + Sync),
+) -> Vec<[f32; 4]> {
+    let tiling = Tiling { width, height };
+    let mut tiles = vec![Vec::new(); tiling.count() as usize];
+    let done = AtomicU32::new(0);
+    each_tile(&mut tiles, worker, |worker, index, tile: &mut Vec<[f32; 4]>| {
+        tile.extend(tiling.pixels(index).map(|[x, y]| pixel(worker, x, y)));
+        progress(done.fetch_add(1, Ordering::Relaxed) + 1, tiling.count());
+    });
+    tiling.rows(tiles)
 }
 
 /// Does some work on every tile, on all cores. Each thread has a worker of its own.

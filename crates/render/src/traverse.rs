@@ -8,14 +8,17 @@
 //! After Amanatides & Woo, "A Fast Voxel Traversal Algorithm for Ray Tracing", 1987, and Museth, "Hierarchical
 //! Digital Differential Analyzer for Efficient Ray-Marching in OpenVDB", 2014.
 
+use std::sync::OnceLock;
+
 use glam::{DMat3, DVec3, IVec3, Mat3, Vec3};
-use nuage_volume::accessor::Accessor;
+use nuage_volume::accessor::{Accessor, BrickPlace};
 use nuage_volume::channel::Channel;
 use nuage_volume::space::LOG2_NODE5_BRICKS;
-use nuage_volume::tree::Content;
+use nuage_volume::tree::{Content, Tree};
 
 use crate::blocks::{BlockStore, Blocks};
 use crate::camera::Ray;
+use crate::walk::{BrickMap, BrickSpan, SpanContent};
 
 /// A channel made ready for rays: its transform inverted, its extent in the coordinates of the walk.
 ///
@@ -25,6 +28,8 @@ use crate::camera::Ray;
 pub struct Field<'a> {
     channel: &'a Channel,
     blocks: BlockStore,
+    /// Made when the first ray asks for it.
+    map: OnceLock<Option<BrickMap>>,
     index_from_world: DMat3,
     /// World origin in positions of the walk.
     offset: DVec3,
@@ -106,11 +111,56 @@ impl<'a> Field<'a> {
         Some(Field {
             channel,
             blocks: BlockStore::new(&channel.tree),
+            map: OnceLock::new(),
             index_from_world: inverse.matrix3,
             offset: inverse.translation - base,
             base_brick,
             brick_box: [min >> 3, max >> 3],
             bounds: [min.as_dvec3() - base, max.as_dvec3() + 1.0 - base],
+        })
+    }
+
+    /// A flat map of the field's bricks, unless they are too many.
+    #[inline]
+    pub(crate) fn map(&self) -> Option<&BrickMap> {
+        let [first, last] = self.brick_box;
+        self.map.get_or_init(|| BrickMap::new(&mut Accessor::new(&self.channel.tree), first, last)).as_ref()
+    }
+
+    /// The brick whose first voxel is at a position of the walk.
+    pub(crate) fn brick_at(&self, corner: Vec3) -> IVec3 {
+        (corner * 0.125).as_ivec3().wrapping_add(self.base_brick)
+    }
+
+    /// The same field, to be walked by its tree.
+    #[cfg(test)]
+    pub(crate) fn without_map(self) -> Self {
+        Field { map: OnceLock::from(None), ..self }
+    }
+
+    /// The tree of the channel.
+    #[inline(always)]
+    pub(crate) fn tree(&self) -> &'a Tree {
+        &self.channel.tree
+    }
+
+    /// The voxel whose place is a position of the walk.
+    pub(crate) fn voxel_at(&self, place: Vec3) -> IVec3 {
+        place.as_ivec3().wrapping_add(self.base_brick << 3)
+    }
+
+    /// The first voxel of the active box, and its size.
+    pub(crate) fn voxel_box(&self) -> [DVec3; 2] {
+        let size = self.bounds[1] - self.bounds[0] - 1.0;
+        [self.bounds[0] + 1.0 + self.base_brick.as_dvec3() * 8.0, size]
+    }
+
+    /// The corners, in the world, of the box of all voxels other than zero.
+    pub(crate) fn world_corners(&self) -> [DVec3; 8] {
+        let [first, size] = self.voxel_box();
+        std::array::from_fn(|i| {
+            let corner = DVec3::new((i >> 2) as f64, (i >> 1 & 1) as f64, (i & 1) as f64);
+            self.channel.world_from_index.transform_point3(first - 0.5 + corner * size)
         })
     }
 
@@ -125,21 +175,27 @@ impl<'a> Field<'a> {
 
     /// Where a ray enters and leaves the field, as distances from its origin.
     pub fn interval(&self, ray: &Ray) -> Option<[f64; 2]> {
-        let origin = self.index_from_world * ray.origin + self.offset;
+        self.interval_of(ray, 0.0)
+    }
+
+    /// The same for a ray that is moved by as many voxels along each axis.
+    #[inline]
+    pub(crate) fn interval_of(&self, ray: &Ray, shift_voxels: f64) -> Option<[f64; 2]> {
+        let origin = self.index_from_world * ray.origin + self.offset + shift_voxels;
         let direction = self.index_from_world * ray.direction;
+        let inverse = direction.recip();
+        let (low, high) = ((self.bounds[0] - origin) * inverse, (self.bounds[1] - origin) * inverse);
+        let (near, far) = (low.min(high), low.max(high));
         let [mut t0, mut t1] = [0.0f64, f64::INFINITY];
         for axis in 0..3 {
-            let (low, high) = (self.bounds[0][axis], self.bounds[1][axis]);
             if direction[axis] == 0.0 {
-                if origin[axis] < low || origin[axis] > high {
+                if origin[axis] < self.bounds[0][axis] || origin[axis] > self.bounds[1][axis] {
                     return None;
                 }
                 continue;
             }
-            let a = (low - origin[axis]) / direction[axis];
-            let b = (high - origin[axis]) / direction[axis];
-            t0 = t0.max(a.min(b));
-            t1 = t1.min(a.max(b));
+            t0 = if near[axis] > t0 { near[axis] } else { t0 };
+            t1 = if far[axis] < t1 { far[axis] } else { t1 };
         }
         (t0 < t1).then_some([t0, t1])
     }
@@ -148,6 +204,11 @@ impl<'a> Field<'a> {
     pub fn local(&self, ray: &Ray, start: f64) -> LocalRay {
         let origin = self.index_from_world * (ray.origin + ray.direction * start) + self.offset;
         LocalRay::new(origin.as_vec3(), (self.index_from_world * ray.direction).as_vec3())
+    }
+
+    /// Voxels per world length along a ray.
+    pub(crate) fn voxels_per_length(&self, ray: &Ray) -> f64 {
+        (self.index_from_world * ray.direction).length()
     }
 
     /// Takes directions of the world to positions of this field.
@@ -217,6 +278,11 @@ impl LocalRay {
     #[inline]
     pub fn at(&self, t: f32) -> Vec3 {
         self.origin + self.direction * t
+    }
+
+    /// One over the direction.
+    pub(crate) fn inverse(&self) -> Vec3 {
+        self.inverse
     }
 
     /// Where the ray enters and leaves a box; empty if it misses.
@@ -290,6 +356,57 @@ impl Runs<'_, '_> {
         None
     }
 
+    /// The next brick or homogeneous part of a tile that is not empty. To be used instead of the iterator.
+    pub(crate) fn next_brick(&mut self) -> Option<BrickSpan> {
+        while self.t < self.t_end {
+            let (t0, brick) = (self.t, self.brick);
+            let content = match self.accessor.place(brick) {
+                BrickPlace::Entry(entry) => {
+                    self.step_brick();
+                    let bounds = self.accessor.tree().node4.footprints[entry];
+                    match u32::try_from(entry) {
+                        Ok(entry) if !bounds.is_constant() => SpanContent::Entry(entry),
+                        _ => SpanContent::Constant(bounds.max),
+                    }
+                }
+                BrickPlace::Zero => {
+                    self.step_brick();
+                    continue;
+                }
+                BrickPlace::Tile => self.cross_tile(),
+            };
+            let t1 = self.t.min(self.t_end);
+            if content != SpanContent::Constant(0.0) && t0 < t1 {
+                let corner = brick.wrapping_sub(self.base_brick).as_vec3() * 8.0;
+                return Some(BrickSpan { t0, t1, corner, content });
+            }
+        }
+        None
+    }
+
+    /// Moves on through a tile as far as it has one value, or by one brick of the layer that blends with the neighbours.
+    fn cross_tile(&mut self) -> SpanContent {
+        let region = self.accessor.region(self.brick);
+        let (origin, last) = extent(self.brick, region.log2_bricks);
+        if region.footprint.is_constant() {
+            self.leap_over(origin, last);
+            if region.footprint.max == 0.0 && region.log2_bricks == LOG2_NODE5_BRICKS {
+                self.leap_to_root_entry();
+            }
+            return SpanContent::Constant(region.footprint.max);
+        }
+        match region.content {
+            Content::Constant(value) if self.brick.cmplt(last).all() => {
+                self.leap_over(origin, last - 1);
+                SpanContent::Constant(value)
+            }
+            _ => {
+                self.step_brick();
+                SpanContent::TileBorder
+            }
+        }
+    }
+
     /// Moves on to the next brick.
     #[inline]
     fn step_brick(&mut self) {
@@ -317,6 +434,11 @@ impl Runs<'_, '_> {
     /// Moves on to where the ray leaves a region of more than one brick, and to the brick behind.
     fn leap(&mut self, log2_bricks: u32) {
         let (origin, last) = extent(self.brick, log2_bricks);
+        self.leap_over(origin, last);
+    }
+
+    /// Moves on to where the ray leaves a box of bricks, first and last, and to the brick behind.
+    fn leap_over(&mut self, origin: IVec3, last: IVec3) {
         let forward = self.ray.direction.cmpge(Vec3::ZERO);
         let faces = IVec3::select(forward, last + 1, origin);
         let t = self.faces_at(faces);

@@ -1,0 +1,178 @@
+//! Our side of `bench/rays_vs_nanovdb.sh`: one kernel over all pixels of a picture, timed.
+//!
+//! `cargo run --release -p nuage-render --example rays -- FILE.vdb KERNEL THREADS REPEATS [SIZE [PICTURE.f32 [SEED]]]`
+//! prints one line: `median_ms=... min_ms=... cpu_ms=... mean=...`. Reading the file is not timed, and one picture is made before
+//! the first that is. The view, the kernels and the picture are those of `bench/peers/nanovdb_rays.cc`, which says more.
+
+#![allow(clippy::print_stdout, reason = "the line printed is what the program is for")]
+
+use std::error::Error;
+use std::time::Instant;
+
+use glam::{DVec2, DVec3};
+use nuage_pipeline::import::{import, import_surface};
+use nuage_render::camera::{Camera, Ray};
+use nuage_render::depth::{optical_depth, stepped_transmittance};
+use nuage_render::filter::Filter;
+use nuage_render::hash::{hash_pixel, hash_u32, unit_f32};
+use nuage_render::surface::first_hit;
+use nuage_render::track::first_collision;
+use nuage_render::traverse::{Field, Reader};
+use nuage_volume::channel::Channel;
+use rayon::prelude::*;
+
+/// Per voxel at density 1.
+const EXTINCTION_PER_VOXEL: f64 = 0.1;
+const STEP_VOXELS: f32 = 0.5;
+const TILE: u32 = 16;
+
+/// The channel of a file's first grid, and the value at its surface if it is a level set that is to be drawn.
+fn channel(path: &str, is_surface: bool) -> Result<(Channel, f32), Box<dyn Error>> {
+    let bytes = std::fs::read(path)?;
+    let file = nuage_vdb::File::open(bytes.as_slice())?;
+    let grid = file.read_all()?.into_iter().next().ok_or("the file has no grid")?;
+    Ok(match is_surface {
+        true => import_surface(grid)?,
+        false => (import(grid)?.0, 0.0),
+    })
+}
+
+/// The picture of a kernel, row by row, and how many milliseconds it took.
+fn picture<'a, P: Send>(
+    field: &Field<'a>,
+    size: u32,
+    pixel: &(dyn Fn(&mut Reader<'a>, u32, u32) -> P + Sync),
+) -> (Vec<(u32, Vec<P>)>, f64) {
+    let begin = Instant::now();
+    let columns = size.div_ceil(TILE);
+    let tiles = (0..columns * columns).into_par_iter().map_init(
+        || field.reader(),
+        |reader, tile| {
+            let (left, top) = (tile % columns * TILE, tile / columns * TILE);
+            let (across, down) = (TILE.min(size - left), TILE.min(size - top));
+            let pixels = (0..across * down).map(|i| pixel(reader, left + i % across, top + i / across));
+            (tile, pixels.collect())
+        },
+    );
+    let tiles = tiles.collect();
+    (tiles, begin.elapsed().as_secs_f64() * 1e3)
+}
+
+/// The time that all threads of this program were running, in milliseconds, where the system tells.
+fn cpu_ms() -> f64 {
+    let threads = std::fs::read_dir("/proc/self/task").into_iter().flatten().flatten();
+    let nanoseconds = threads.filter_map(|thread| {
+        let text = std::fs::read_to_string(thread.path().join("schedstat")).ok()?;
+        text.split_whitespace().next()?.parse::<f64>().ok()
+    });
+    nanoseconds.sum::<f64>() * 1e-6
+}
+
+fn median(values: &mut [f64]) -> f64 {
+    values.sort_by(f64::total_cmp);
+    0.5 * (values[values.len() / 2] + values[(values.len() - 1) / 2])
+}
+
+/// What a kernel makes of a pixel.
+type Pixels<'r, 'a> = Box<dyn Fn(&mut Reader<'a>, u32, u32) -> f32 + Sync + 'r>;
+
+fn pixels_of<'r, 'a: 'r>(
+    kernel: &str,
+    field: &'r Field<'a>,
+    ray: impl Fn(u32, u32) -> Ray + Sync + 'r,
+    extinction: f32,
+    voxel_size: f64,
+    level: f32,
+    seed: u32,
+) -> Result<Pixels<'r, 'a>, Box<dyn Error>> {
+    Ok(match kernel {
+        "nearest" | "trilinear" => {
+            let filter = if kernel == "nearest" { Filter::Nearest } else { Filter::Trilinear };
+            Box::new(move |reader, x, y| {
+                1.0 - stepped_transmittance(field, reader, &ray(x, y), filter, STEP_VOXELS, extinction)
+            })
+        }
+        "exact" | "cubic" => {
+            let filter = if kernel == "exact" { Filter::Nearest } else { Filter::Trilinear };
+            Box::new(move |reader, x, y| {
+                1.0 - (-extinction * optical_depth(field, reader, &ray(x, y), filter)).exp()
+            })
+        }
+        "track" => Box::new(move |reader, x, y| {
+            let (path, mut count) = (hash_pixel(x, y, 0, hash_u32(seed)), 0_u32);
+            let random = || {
+                count += 1;
+                unit_f32(hash_u32(path.wrapping_add(count)))
+            };
+            f32::from(first_collision(field, reader, &ray(x, y), extinction, random).is_some())
+        }),
+        "surface" | "surface-shaded" => {
+            let is_shaded = kernel == "surface-shaded";
+            Box::new(move |reader, x, y| {
+                let ray = ray(x, y);
+                first_hit(field, reader, &ray, level).map_or(0.0, |hit| match is_shaded {
+                    true => hit.normal.dot(ray.direction.as_vec3()).abs(),
+                    false => (hit.distance / voxel_size) as f32,
+                })
+            })
+        }
+        _ => return Err(format!("no kernel '{kernel}'").into()),
+    })
+}
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let [path, kernel, threads, repeats, rest @ ..] = arguments.as_slice() else {
+        return Err("usage: rays FILE.vdb KERNEL THREADS REPEATS [SIZE [PICTURE.f32 [SEED]]]".into());
+    };
+    let repeats: usize = repeats.parse()?;
+    let size: u32 = rest.first().map_or(Ok(1024), |size| size.parse())?;
+    let seed: u32 = rest.get(2).map_or(Ok(0), |seed| seed.parse())?;
+    let (channel, level) = channel(path, kernel.starts_with("surface"))?;
+    let field = Field::new(&channel).ok_or("the grid is empty")?;
+    let active = channel.active_box.ok_or("the grid is empty")?;
+    let (low, extent) = (active.min.as_dvec3(), (active.max - active.min + 1).as_dvec3());
+    // Voxels of NanoVDB's nearest filter begin at their place; ours are centred on it.
+    let shift = if kernel == "nearest" || kernel == "exact" { 0.5 } else { 0.0 };
+    let target = low + 0.5 * extent - shift;
+    let eye = target + DVec3::new(0.0, 0.0, 2.0 * extent.z);
+    let world = |p: DVec3| channel.world_from_index.transform_point3(p);
+    let camera = Camera::look_at(world(eye), world(target), DVec3::Y, 45.0).ok_or("no view")?;
+    let voxel_size = channel.world_from_index.matrix3.x_axis.length();
+    let extinction = (EXTINCTION_PER_VOXEL / voxel_size) as f32;
+    let ray = |x: u32, y: u32| -> Ray {
+        camera.ray(DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5), size, size)
+    };
+    let pixel = pixels_of(kernel, &field, ray, extinction, voxel_size, level, seed)?;
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads.parse()?).build()?;
+    let (mut times, mut cpu_times) = (Vec::new(), Vec::new());
+    let mut tiles = Vec::new();
+    for turn in 0..=repeats {
+        let cpu = cpu_ms();
+        let (made, time) = pool.install(|| picture(&field, size, &*pixel));
+        if turn > 0 {
+            times.push(time);
+            cpu_times.push(cpu_ms() - cpu);
+        }
+        tiles = made;
+    }
+    if times.is_empty() {
+        return Err("nothing was timed".into());
+    }
+    let mut values = vec![0.0_f32; size as usize * size as usize];
+    let columns = size.div_ceil(TILE);
+    for (tile, pixels) in tiles {
+        let (left, top) = (tile % columns * TILE, tile / columns * TILE);
+        let across = TILE.min(size - left);
+        for (i, value) in (0..).zip(pixels) {
+            values[((top + i / across) * size + left + i % across) as usize] = value;
+        }
+    }
+    let mean = values.iter().map(|v| f64::from(*v)).sum::<f64>() / values.len() as f64;
+    let (time, cpu) = (median(&mut times), median(&mut cpu_times));
+    println!("median_ms={time:.3} min_ms={:.3} cpu_ms={cpu:.3} mean={mean:.6}", times[0]);
+    if let Some(path) = rest.get(1) {
+        std::fs::write(path, values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<_>>())?;
+    }
+    Ok(())
+}

@@ -1,0 +1,115 @@
+//! Four simple views of a field, for whoever looks for a mistake: accumulated density, depth of the first voxel, its index and
+//! its density. They need no light and no settings, and what they show is exact.
+
+use glam::DVec2;
+
+use crate::camera::{Camera, Ray};
+use crate::depth::optical_depth;
+use crate::film::{Image, ImageSizeError};
+use crate::filter::Filter;
+use crate::math::one_minus_exp_neg;
+use crate::picture::each_pixel;
+use crate::surface::{VoxelHit, first_voxel};
+use crate::traverse::{Field, Reader};
+
+/// What a view shows of the voxels along a ray.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum View {
+    /// White as opaque as the density along the ray makes it, `extinction` being that of density 1 per world length.
+    Density {
+        /// Per world length.
+        extinction: f32,
+    },
+    /// How far away the first voxel of a density above 0 is: white at the near end of the field's distances from the camera,
+    /// black at the far end.
+    Depth,
+    /// Where that voxel is, as a hue: its index `x + y n + z n²` in the field's box of n voxels along its longest axis.
+    Index,
+    /// The density of that voxel, as a hue from red at 0 to magenta at the largest.
+    FirstDensity,
+}
+
+/// What a view makes of rays through a field.
+pub struct Viewer<'f, 'a> {
+    field: &'f Field<'a>,
+    view: View,
+    /// The nearest and furthest distance of a voxel from the camera.
+    distances: [f64; 2],
+    largest: f32,
+}
+
+impl<'f, 'a> Viewer<'f, 'a> {
+    /// Makes a view ready.
+    pub fn new(field: &'f Field<'a>, view: View, camera: &Camera) -> Self {
+        let corners = field.world_corners().map(|corner| (corner - camera.origin).length());
+        let furthest = corners.into_iter().fold(0.0, f64::max);
+        let centre = field.world_corners().into_iter().sum::<glam::DVec3>() / 8.0;
+        let radius = field.world_corners().map(|corner| (corner - centre).length());
+        let radius = radius.into_iter().fold(0.0, f64::max);
+        let nearest = ((centre - camera.origin).length() - radius).max(0.0);
+        Viewer { field, view, distances: [nearest, furthest], largest: field.tree().bounds().max }
+    }
+
+    /// Colour and opacity, linear light, colours times opacity.
+    pub fn pixel(&self, reader: &mut Reader<'a>, ray: &Ray) -> [f32; 4] {
+        if let View::Density { extinction } = self.view {
+            let depth = optical_depth(self.field, reader, ray, Filter::Trilinear);
+            return [one_minus_exp_neg(extinction * depth); 4];
+        }
+        let Some(hit) = first_voxel(self.field, reader, ray, 0.0) else { return [0.0; 4] };
+        let [r, g, b] = self.colour(&hit);
+        [r, g, b, 1.0]
+    }
+
+    fn colour(&self, hit: &VoxelHit) -> [f32; 3] {
+        match self.view {
+            View::Density { .. } | View::Depth => {
+                let [nearest, furthest] = self.distances;
+                let share = (hit.distance - nearest) / (furthest - nearest);
+                [(1.0 - share).clamp(0.0, 1.0) as f32; 3]
+            }
+            View::Index => {
+                let [first, size] = self.field.voxel_box();
+                // In doubles: 4096³ is beyond what single precision counts.
+                let local = (hit.voxel.as_dvec3() - first).max(glam::DVec3::ZERO);
+                let side = size.max_element();
+                let index = local.x + side * (local.y + side * local.z);
+                hue((index / (side * side * side)) as f32)
+            }
+            // Up to magenta: a full circle would end at the red with which it began.
+            View::FirstDensity => hue(hit.value / self.largest * (5.0 / 6.0)),
+        }
+    }
+}
+
+/// The full colour of a hue, where 0 and 1 are red, a third green and two thirds blue.
+pub fn hue(turns: f32) -> [f32; 3] {
+    let turns = turns - turns.floor();
+    [0.0, 2.0, 4.0].map(|shift| {
+        let sixth = (turns * 6.0 - shift).rem_euclid(6.0);
+        (2.0 - (sixth.min(6.0 - sixth))).clamp(0.0, 1.0)
+    })
+}
+
+/// The picture of a view, through the centres of pixels.
+///
+/// `progress` is called with tiles done and tiles in all, from any thread.
+///
+/// # Errors
+/// If the picture has no pixels or too many.
+pub fn render_view<'a>(
+    field: &Field<'a>,
+    view: View,
+    camera: &Camera,
+    [width, height]: [u32; 2],
+    progress: &(dyn Fn(u32, u32) + Sync),
+) -> Result<Image, ImageSizeError> {
+    let mut image = Image::new(width, height)?;
+    let viewer = Viewer::new(field, view, camera);
+    let pixel = |reader: &mut Reader<'a>, x: u32, y: u32| {
+        let ray = camera.ray(DVec2::new(x.into(), y.into()) + 0.5, width, height);
+        viewer.pixel(reader, &ray)
+    };
+    image.pixels = each_pixel([width, height], || field.reader(), pixel, progress);
+    Ok(image)
+}
