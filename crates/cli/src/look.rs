@@ -17,6 +17,21 @@ pub(crate) enum Integrator {
     Path,
 }
 
+/// What a picture shows in place of light.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub(crate) enum View {
+    /// Opacity by the density along the ray, exact.
+    Density,
+    /// The distance of the first voxel above 0: white is near, black is far.
+    Depth,
+    /// The place of that voxel in the box of voxels, as a hue.
+    Index,
+    /// The density of that voxel, as a hue from red at 0 to magenta at the largest.
+    FirstDensity,
+    /// A level set's surface, bright where it faces the camera.
+    Surface,
+}
+
 /// View, light, medium and quality.
 #[derive(Debug, clap::Args, Clone)]
 pub(crate) struct Look {
@@ -122,6 +137,10 @@ pub(crate) struct Look {
     /// noise)
     #[arg(long, value_enum, default_value_t, value_name = "NAME", help_heading = "Quality")]
     pub(crate) integrator: Integrator,
+
+    /// Show the volume itself in place of light, along the ray through the middle of each pixel
+    #[arg(long, value_enum, value_name = "NAME", help_heading = "Quality")]
+    pub(crate) view: Option<View>,
 
     /// The most that light scatters with --integrator path [default: as often as it does]
     #[arg(long, value_parser = clap::value_parser!(u32).range(0..=1_000_000), value_name = "N", help_heading = "Quality")]

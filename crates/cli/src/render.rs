@@ -19,7 +19,7 @@ use nuage_volume::channel::IndexBox;
 use crate::denoise;
 use crate::error::Failure;
 use crate::frames;
-use crate::look::{Integrator, Look};
+use crate::look::{Integrator, Look, View};
 use crate::plan::{Given, Plan, SkyPlan, VolumePlan, What};
 use crate::progress;
 use crate::scene_file::{self, RunKeys};
@@ -236,6 +236,9 @@ fn check(look: &Look, run: &RunKeys, output: &Path) -> Result<(), String> {
         ("--aovs", run.aovs),
         ("--denoise", run.denoise),
     ];
+    if look.view.is_some() && look.integrator == Integrator::Path {
+        return Err("--view shows no light: leave out --integrator path".into());
+    }
     if let Some((name, _)) = of_paths.iter().find(|(_, is_asked)| *is_asked)
         && look.integrator != Integrator::Path
     {
@@ -388,7 +391,9 @@ fn look_at(
     for (_, inputs) in frames {
         for (volume, path) in plan.volumes.iter().zip(inputs) {
             // A frame that cannot be read is reported when its turn comes.
-            if let Some(Ok(Some(world_box))) = path.as_ref().map(|path| header_box(volume, path)) {
+            if let Some(Ok(Some(world_box))) =
+                path.as_ref().map(|path| header_box(volume, plan.look.view, path))
+            {
                 union = Some(union.map_or(world_box, |u| u.union(world_box)));
             }
         }
@@ -403,11 +408,12 @@ fn look_at(
 }
 
 /// The world box of a volume as the header of its file tells it, or if that does not, as its voxels do.
-fn header_box(volume: &VolumePlan, path: &Path) -> Result<Option<WorldBox>, Failure> {
+fn header_box(volume: &VolumePlan, view: Option<View>, path: &Path) -> Result<Option<WorldBox>, Failure> {
     let disk = DiskFile::open(path)?;
     let file = disk.vdb()?;
     let (grid, glowing) = names(volume);
-    let (density, emission) = shot::choose_grids(&file, grid, glowing).map_err(|e| Failure::file(path, e))?;
+    let (density, emission) =
+        shot::choose_grids(&file, grid, glowing, view).map_err(|e| Failure::file(path, e))?;
     let mut union: Option<WorldBox> = None;
     for index in [Some(density), emission].into_iter().flatten() {
         let info = &file.grids[index];
@@ -442,7 +448,7 @@ fn names(volume: &VolumePlan) -> (Option<&str>, Option<&str>) {
 
 /// Reads the volumes of a frame.
 fn load(plan: &Plan, inputs: &[Option<PathBuf>], warnings: bool) -> Result<Vec<Option<Volume>>, Failure> {
-    let load = |(plan, path): (&VolumePlan, &Option<PathBuf>)| {
+    let load = |(volume_plan, path): (&VolumePlan, &Option<PathBuf>)| {
         let Some(path) = path else { return Ok(None) };
         let disk = DiskFile::open(path)?;
         let file = disk.vdb()?;
@@ -451,10 +457,10 @@ fn load(plan: &Plan, inputs: &[Option<PathBuf>], warnings: bool) -> Result<Vec<O
                 warn(&path.display().to_string(), &message);
             }
         };
-        let (grid, glowing) = names(plan);
-        let mut volume =
-            shot::load_grids(&file, grid, glowing, &mut tell).map_err(|e| Failure::file(path, e))?;
-        volume.transform(&plan.transform);
+        let (grid, glowing) = names(volume_plan);
+        let mut volume = shot::load_grids(&file, grid, glowing, plan.look.view, &mut tell)
+            .map_err(|e| Failure::file(path, e))?;
+        volume.transform(&volume_plan.transform);
         Ok(Some(volume))
     };
     plan.volumes.iter().zip(inputs).map(load).collect()

@@ -21,11 +21,13 @@ use nuage_render::path::PathSettings;
 use nuage_render::picture;
 use nuage_render::progressive::{self, Stopped, Watch};
 use nuage_render::scene::{self, Emission, Phase, Scene, Shape, Spectrum};
+use nuage_render::traverse::Field;
+use nuage_render::views;
 use nuage_vdb::{File, Source};
 use nuage_volume::channel::Channel;
 
 use crate::error::explain;
-use crate::look::{Integrator, Look};
+use crate::look::{Integrator, Look, View};
 use crate::plan::{EmissionPlan, Extinction, Glow, LightPlan, PhasePlan, Plan, SkyPlan};
 use crate::values::{Auto, Background, Size};
 
@@ -36,6 +38,8 @@ const REFERENCE_KELVIN: f32 = 1500.0;
 pub(crate) struct Volume {
     pub(crate) density: Channel,
     pub(crate) emission: Option<Channel>,
+    /// The value at the surface, if the density is a level set to be drawn as one.
+    pub(crate) surface: Option<f32>,
 }
 
 impl Volume {
@@ -68,7 +72,7 @@ pub(crate) struct Shot {
     map: Option<Arc<EnvironmentMap>>,
 }
 
-/// The positions in the file of the density grid and of the grid that glows.
+/// The positions in the file of the density grid, or of what a view shows, and of the grid that glows.
 ///
 /// # Errors
 /// What is wrong, in words.
@@ -76,10 +80,13 @@ pub(crate) fn choose_grids<S: Source>(
     file: &File<S>,
     grid: Option<&str>,
     glowing: Option<&str>,
+    view: Option<View>,
 ) -> Result<(usize, Option<usize>), String> {
-    let density = match grid {
-        Some(name) => select::named_grid(file, name),
-        None => select::density_grid(file),
+    let level_set = select::level_set(file).filter(|_| view == Some(View::Surface));
+    let density = match (grid, level_set) {
+        (Some(name), _) => select::named_grid(file, name),
+        (None, Some(level_set)) => Ok(level_set),
+        (None, None) => select::density_grid(file),
     };
     let emission = glowing.map(|name| select::named_grid(file, name)).transpose();
     Ok((density.map_err(|e| e.to_string())?, emission.map_err(|e| e.to_string())?))
@@ -95,7 +102,7 @@ pub(crate) fn load<S: Source>(
     look: &Look,
     warn: &mut dyn FnMut(String),
 ) -> Result<Volume, String> {
-    load_grids(file, grid, look.temperature.as_deref().or(look.flame.as_deref()), warn)
+    load_grids(file, grid, look.temperature.as_deref().or(look.flame.as_deref()), look.view, warn)
 }
 
 /// As [`load`], by the names of the density grid and of the grid that glows.
@@ -106,9 +113,10 @@ pub(crate) fn load_grids<S: Source>(
     file: &File<S>,
     grid: Option<&str>,
     glowing: Option<&str>,
+    view: Option<View>,
     warn: &mut dyn FnMut(String),
 ) -> Result<Volume, String> {
-    let (density, emission) = choose_grids(file, grid, glowing)?;
+    let (density, emission) = choose_grids(file, grid, glowing, view)?;
     let namesakes = select::namesakes(file, density);
     if namesakes.len() > 1 && grid.is_none_or(|name| name != file.grids[density].unique_name) {
         warn(format!(
@@ -117,6 +125,15 @@ pub(crate) fn load_grids<S: Source>(
             file.grids[density].unique_name,
             namesakes.join(", ")
         ));
+    }
+    if view == Some(View::Surface) {
+        let grid = file.read_grid(density).map_err(|e| explain(&e))?;
+        if !import::is_level_set(&grid) {
+            let name = &file.grids[density].unique_name;
+            return Err(format!("grid '{name}' is no level set: --view surface has nothing to show"));
+        }
+        let (density, level) = import::import_surface(grid).map_err(|e| e.to_string())?;
+        return Ok(Volume { density, emission: None, surface: Some(level) });
     }
     let mut read = |index: usize| -> Result<Channel, String> {
         let grid = file.read_grid(index).map_err(|e| explain(&e))?;
@@ -127,7 +144,7 @@ pub(crate) fn load_grids<S: Source>(
         }
         Ok(channel)
     };
-    Ok(Volume { density: read(density)?, emission: emission.map(read).transpose()? })
+    Ok(Volume { density: read(density)?, emission: emission.map(read).transpose()?, surface: None })
 }
 
 fn messages(name: &str, report: &Report, channel: &Channel) -> Vec<String> {
@@ -296,7 +313,13 @@ impl Shot {
 
     /// What the marcher could not follow, in words; `None` if it is not asked, or can.
     pub(crate) fn unsupported(&self, frame: &Frame<'_>) -> Option<String> {
-        let is_marched = self.plan.look.integrator == Integrator::March;
+        let look = &self.plan.look;
+        if look.view.is_some() {
+            let is_one =
+                matches!(self.scene(frame).volumes[..], [scene::Volume { shape: Shape::Grid(_), .. }]);
+            return (!is_one).then(|| "--view shows one volume, of a file".to_owned());
+        }
+        let is_marched = look.integrator == Integrator::March;
         let what = march::unsupported(&self.scene(frame)).filter(|_| is_marched)?;
         Some(format!("--integrator march cannot render {what}; --integrator path can"))
     }
@@ -322,7 +345,39 @@ impl Shot {
         frame: &Frame<'_>,
         progress: &(dyn Fn(u32, u32) + Sync),
     ) -> Result<Image, ImageSizeError> {
-        self.render_scene(&self.scene(frame), progress)
+        let scene = self.scene(frame);
+        if let Some(view) = self.plan.look.view {
+            let surface = frame.iter().copied().flatten().find_map(|volume| volume.surface);
+            return self.render_view(view, surface, &scene, progress);
+        }
+        self.render_scene(&scene, progress)
+    }
+
+    /// The picture of a volume itself.
+    fn render_view(
+        &self,
+        view: View,
+        surface: Option<f32>,
+        scene: &Scene<'_>,
+        progress: &(dyn Fn(u32, u32) + Sync),
+    ) -> Result<Image, ImageSizeError> {
+        let [width, height] = self.size();
+        let volume = scene.volumes.first();
+        let field = volume.and_then(|volume| volume.shape.channel()).and_then(Field::new);
+        let extinction = volume.map_or(1.0, |volume| volume.extinction[0]);
+        let view = match view {
+            View::Density => views::View::Density { extinction },
+            View::Depth => views::View::Depth,
+            View::Index => views::View::Index,
+            View::FirstDensity => views::View::FirstDensity,
+            View::Surface => views::View::Surface { level: surface.unwrap_or(f32::INFINITY) },
+        };
+        let image = match &field {
+            Some(field) => views::render_view(field, view, &self.camera, [width, height], progress)?,
+            // Nothing is seen of what is empty.
+            None => Image::new(width, height)?,
+        };
+        Ok(self.before(image, scene))
     }
 
     /// The size of the picture.

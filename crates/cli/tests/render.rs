@@ -412,3 +412,33 @@ fn every_float_grid_of_the_edge_cases_is_rendered() {
     }
     assert!(rendered >= 50, "{rendered}");
 }
+
+/// The views show what is there: something of the volume, nothing beside it, each its own.
+#[test]
+fn views_show_the_volume_itself() {
+    let folder = tempfile::tempdir().unwrap();
+    let picture = |input: &Path, options: &str| {
+        let path = folder.path().join("view.exr");
+        let options = format!("--size 32 --background none --overwrite --exr-float {options}");
+        done(&render(input, &path, &options));
+        exr(&path).2
+    };
+    let mut seen: Vec<Vec<[f32; 4]>> = Vec::new();
+    for view in ["density", "depth", "index", "first-density"] {
+        let pixels = picture(&blast("blast.0006.vdb"), &format!("--view {view}"));
+        assert!(pixels.iter().any(|pixel| pixel[3] > 0.5) && pixels[0] == [0.0; 4], "{view}");
+        assert!(pixels.iter().flatten().all(|value| (0.0..=1.0).contains(value)), "{view}");
+        assert!(!seen.contains(&pixels));
+        seen.push(pixels);
+    }
+    // A ball faces the camera in the middle and turns away from it towards its rim.
+    let ball = picture(&edge("comp_sphere_blosc.vdb"), "--view surface");
+    let middle = ball[16 * 32 + 16];
+    assert!(middle[0] > 0.95 && middle[3] == 1.0, "{middle:?}");
+    let rim = ball.iter().filter(|pixel| pixel[3] == 1.0).map(|pixel| pixel[0]);
+    assert!(rim.fold(1.0, f32::min) < 0.6);
+
+    let out = folder.path().join("out.png");
+    fails(&render(&blast("blast.0006.vdb"), &out, "--view surface"), 1, "is no level set");
+    fails(&render(&blast("blast.0006.vdb"), &out, "--view depth --integrator path"), 2, "--view");
+}

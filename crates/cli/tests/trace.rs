@@ -131,7 +131,7 @@ fn layers_add_up_to_the_picture_and_carry_the_scene() {
     assert!(parts.iter().all(|part| part.iter().any(|light| *light > 0.0)));
     assert!(channel("samples.Y").iter().all(|count| *count == 4.0));
     assert!(channel("Z").iter().any(|depth| depth.is_finite() && *depth > 0.0));
-    let text = layer.attributes.other.iter().find(|(name, _)| name.to_string() == "nuage/scene");
+    let text = layer.attributes.other.iter().find(|(name, _)| **name == *"nuage/scene");
     let (_, exr::prelude::AttributeValue::Text(text)) = text.unwrap() else { panic!("no text") };
     assert!(text.to_string().contains("[[volumes]]"));
 

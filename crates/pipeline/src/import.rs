@@ -117,7 +117,7 @@ enum Meaning {
 
 impl Meaning {
     fn of(grid: &Grid, tree: &Tree<f32>) -> Self {
-        if grid.grid_class() != "level set" {
+        if !is_level_set(grid) {
             return Meaning::Density;
         }
         Meaning::LevelSet { band: Meaning::band(grid, tree) }
@@ -155,6 +155,11 @@ impl Meaning {
 /// If the transform is not linear and invertible, or the tree becomes too large.
 pub fn import(grid: Grid) -> Result<(Channel, Report), ImportError> {
     import_as(grid, Meaning::of)
+}
+
+/// Whether a grid says that it is a level set.
+pub fn is_level_set(grid: &Grid) -> bool {
+    grid.grid_class() == "level set"
 }
 
 /// Turns a level set into a channel that is to be drawn as a surface: the distance of the band's outer end, 0 there, twice the

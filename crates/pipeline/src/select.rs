@@ -62,6 +62,11 @@ pub fn density_grid<S: Source>(file: &File<S>) -> Result<usize, SelectError> {
         })
 }
 
+/// The first level set of a file, if it has one that can be drawn.
+pub fn level_set<S: Source>(file: &File<S>) -> Option<usize> {
+    file.grids.iter().position(|grid| is_drawable(grid) && grid.grid_class() == "level set")
+}
+
 /// The unique names of all grids that share the plain name of grid `index`.
 pub fn namesakes<S: Source>(file: &File<S>, index: usize) -> Vec<&str> {
     let Some(grid) = file.grids.get(index) else { return Vec::new() };

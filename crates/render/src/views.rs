@@ -1,5 +1,5 @@
-//! Four simple views of a field, for whoever looks for a mistake: accumulated density, depth of the first voxel, its index and
-//! its density. They need no light and no settings, and what they show is exact.
+//! Simple views of a field, for whoever looks for a mistake: accumulated density, depth of the first voxel, its index and
+//! its density, and the surface of a level set. They need no light and no settings, and what they show is exact.
 
 use glam::DVec2;
 
@@ -9,7 +9,7 @@ use crate::film::{Image, ImageSizeError};
 use crate::filter::Filter;
 use crate::math::one_minus_exp_neg;
 use crate::picture::each_pixel;
-use crate::surface::{VoxelHit, first_voxel};
+use crate::surface::{VoxelHit, first_hit, first_voxel};
 use crate::traverse::{Field, Reader};
 
 /// What a view shows of the voxels along a ray.
@@ -27,6 +27,11 @@ pub enum View {
     Index,
     /// The density of that voxel, as a hue from red at 0 to magenta at the largest.
     FirstDensity,
+    /// Where values reach a level: white where it faces the camera, black where it is seen from the side.
+    Surface {
+        /// The value at the surface.
+        level: f32,
+    },
 }
 
 /// What a view makes of rays through a field.
@@ -56,6 +61,13 @@ impl<'f, 'a> Viewer<'f, 'a> {
             let depth = optical_depth(self.field, reader, ray, Filter::Trilinear);
             return [one_minus_exp_neg(extinction * depth); 4];
         }
+        if let View::Surface { level } = self.view {
+            let hit = first_hit(self.field, reader, ray, level);
+            return hit.map_or([0.0; 4], |hit| {
+                let facing = (-hit.normal.dot(ray.direction.as_vec3())).clamp(0.0, 1.0);
+                [facing, facing, facing, 1.0]
+            });
+        }
         let Some(hit) = first_voxel(self.field, reader, ray, 0.0) else { return [0.0; 4] };
         let [r, g, b] = self.colour(&hit);
         [r, g, b, 1.0]
@@ -63,7 +75,7 @@ impl<'f, 'a> Viewer<'f, 'a> {
 
     fn colour(&self, hit: &VoxelHit) -> [f32; 3] {
         match self.view {
-            View::Density { .. } | View::Depth => {
+            View::Density { .. } | View::Depth | View::Surface { .. } => {
                 let [nearest, furthest] = self.distances;
                 let share = (hit.distance - nearest) / (furthest - nearest);
                 [(1.0 - share).clamp(0.0, 1.0) as f32; 3]

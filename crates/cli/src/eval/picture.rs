@@ -72,9 +72,9 @@ impl Studio {
             true => {
                 let nothing = Tree::empty(0.0_f32, nuage_vdb::Shape::STANDARD);
                 let smoke = Grid { tree: Arc::new(nothing.into()), ..source.clone() };
-                Volume { density: self::channel(smoke)?, emission: Some(channel) }
+                Volume { density: self::channel(smoke)?, emission: Some(channel), surface: None }
             }
-            false => Volume { density: channel, emission: None },
+            false => Volume { density: channel, emission: None, surface: None },
         };
         let volumes = [volume];
         let shot = Shot::new(look, world_box, &volumes)?;

@@ -17,7 +17,7 @@ use nuage_render::light::{Light, Spot};
 use toml::de::DeTable;
 
 use crate::error::Failure;
-use crate::look::{Integrator, Look, MOST_SAMPLES, not_negative, seconds, share, up};
+use crate::look::{Integrator, Look, MOST_SAMPLES, View, not_negative, seconds, share, up};
 use crate::plan::{
     EmissionPlan, Extinction, Given, Glow, LightPlan, PhasePlan, Plan, SkyPlan, VolumePlan, What,
 };
@@ -105,6 +105,11 @@ fn parse(text: &str, folder: &Path, look: &Look, given: &Given) -> Result<(Plan,
                 .map_err(|_| "'march' or 'path' is needed".into())
         })?;
         put(given, "integrator", &mut look.integrator, kind);
+        let view = integrator.parsed("view", |text| {
+            <View as clap::ValueEnum>::from_str(text, false)
+                .map_err(|_| "'density', 'depth', 'index', 'first-density' or 'surface' is needed".into())
+        })?;
+        put(given, "view", &mut look.view, view.map(Some));
         let samples = integrator.parsed("samples", count(1, MOST_SAMPLES as u32))?;
         put(given, "samples", &mut look.samples, samples.map(Some));
         put(given, "noise", &mut look.noise, integrator.parsed("noise", values::positive)?.map(Some));

@@ -46,10 +46,12 @@ pub(crate) fn save(plan: &Plan, run: &RunKeys, folder: &Path) -> String {
         ],
     );
     let kind = look.integrator.to_possible_value().map(|value| quoted(value.get_name()));
+    let view = look.view.and_then(|view| view.to_possible_value()).map(|value| quoted(value.get_name()));
     table(
         "[integrator]",
         vec![
             ("kind", kind),
+            ("view", view),
             ("samples", look.samples.map(|samples| samples.to_string())),
             ("noise", look.noise.map(|noise| noise.to_string())),
             ("time", look.time.map(|time| time.to_string())),

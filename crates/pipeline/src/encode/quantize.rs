@@ -115,7 +115,7 @@ impl<'a> Measure<'a> {
 
     /// The codecs to be tried unless one is asked for, the cheapest first. The last can hold any brick.
     pub fn codecs(&self) -> impl Iterator<Item = Codec> + use<> {
-        let sparse = self.sparse.as_ref().map_or(Vec::new(), Sparse::codecs);
+        let sparse = self.sparse.as_ref().map_or(Vec::new(), |sparse| sparse.codecs(self.values, self.scale));
         // Where much is empty, codes for all voxels do not pay.
         let is_tried = match self.sparse.as_ref().is_some_and(Sparse::is_mostly_empty) {
             true => |codec: &Codec| !has_codes(*codec),
@@ -361,6 +361,10 @@ impl Range {
     pub(super) fn of(residuals: impl Iterator<Item = f32>) -> Range {
         let (min, max) = bounds(residuals);
         Range { min, max }
+    }
+
+    pub(super) fn width(self) -> f32 {
+        self.max - self.min
     }
 
     /// Voxels at the floor need a code that leads to or below it, and none above.

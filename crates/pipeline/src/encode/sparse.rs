@@ -47,7 +47,7 @@ struct Kept {
 const LOST_BIAS: f64 = 15.0;
 
 /// How often corners are fitted anew, with what they predicted in the place of empty voxels.
-const ROUNDS: usize = 6;
+const ROUNDS: usize = 4;
 
 /// Fewer voxels than this are not fitted.
 const FITTED_VOXELS: usize = 24;
@@ -85,19 +85,30 @@ impl Sparse {
     }
 
     /// The codecs that can be worth trying, the cheapest first.
-    pub(super) fn codecs(&self) -> Vec<Codec> {
-        let ways = if self.voxels >= FITTED_VOXELS { &[false, true][..] } else { &[false] };
-        let codec = |is_fitted: bool| {
-            move |kept: &Kept| {
-                let pairs = (head_words(is_fitted) + kept.words).div_ceil(2) as u8;
-                Codec::Sparse { is_fitted, pairs }
-            }
+    pub(super) fn codecs(&self, values: &Brick, scale: &ChannelScale) -> Vec<Codec> {
+        let is_fitted = self.is_worth_fitting(values, scale);
+        let codec = |kept: &Kept| {
+            let pairs = (head_words(is_fitted) + kept.words).div_ceil(2) as u8;
+            Codec::Sparse { is_fitted, pairs }
         };
-        let mut codecs: Vec<Codec> =
-            ways.iter().flat_map(|is_fitted| self.by_bits.iter().map(codec(*is_fitted))).collect();
-        codecs.sort_by_key(|codec| codec.word_count());
+        let mut codecs = self.by_bits.map(|kept| codec(&kept)).to_vec();
+        // With more bits more voxels are kept.
         codecs.dedup();
         codecs
+    }
+
+    /// Whether corners save more bits of codes than they take: one for each halving of the range.
+    fn is_worth_fitting(&self, values: &Brick, scale: &ChannelScale) -> bool {
+        if self.voxels < FITTED_VOXELS {
+            return false;
+        }
+        let kept = &self.by_bits[MAX_BITS / 2];
+        let [plain, fitted] = [false, true].map(|is_fitted| {
+            let (_, range) = kept.fill(values, self.predicted(is_fitted, values, scale), scale);
+            range.width()
+        });
+        let extra = head_words(true) - head_words(false);
+        (plain / fitted).log2() * self.voxels as f32 > 32.0 * extra as f32
     }
 
     /// The error in a codec of so many words. `None` if they are too few.
@@ -174,10 +185,9 @@ impl Kept {
         let mut is_there = sparse::Presence::default();
         let (mut squared, mut max) = ([0.0_f32; ROW], [0.0_f32; ROW]);
         for (row, values) in values.as_chunks::<ROW>().0.iter().enumerate() {
-            let mut bits = 0;
+            let bits = (0..ROW).fold(0, |bits, i| bits | u64::from(values[i].abs() > above) << i);
             for (i, value) in values.iter().enumerate() {
                 let magnitude = value.abs();
-                bits |= u64::from(magnitude > above) << i;
                 let lost = if magnitude > above { 0.0 } else { magnitude };
                 squared[i] += (lost * inverse_unit) * (lost * inverse_unit);
                 max[i] = if lost > max[i] { lost } else { max[i] };
@@ -211,8 +221,9 @@ impl Kept {
             for i in 0..ROW {
                 let residual = values[i] - predicted[i];
                 let holds = self.holds(values[i]);
-                min[i] = if holds && residual < min[i] { residual } else { min[i] };
-                max[i] = if holds && residual > max[i] { residual } else { max[i] };
+                // Not `&&`: a branch would keep lanes apart.
+                min[i] = if holds & (residual < min[i]) { residual } else { min[i] };
+                max[i] = if holds & (residual > max[i]) { residual } else { max[i] };
             }
         }
         let range = Range::of(min.into_iter().chain(max).filter(|residual| residual.is_finite()));
