@@ -253,7 +253,7 @@ const KEPT_BYTES: u64 = 1 << 30;
 #[cfg(feature = "native-zstd")]
 pub fn compress(bytes: &[u8]) -> Vec<u8> {
     /// Higher levels take long and give little on codes.
-    const LEVEL: i32 = 12;
+    const LEVEL: i32 = 6;
     // It fails for lack of memory only; the bytes are then stored as they are.
     zstd::bulk::compress(bytes, LEVEL).unwrap_or_default()
 }
