@@ -459,9 +459,9 @@ fn sequences_are_compared_frame_by_frame() {
     assert!(least <= psnr && psnr <= ratios.into_iter().fold(0.0, f64::max), "{psnr}");
     let [a, b] = [0, 1].map(|i| voxels["max_error_values"][i].as_f64().unwrap());
     assert!(((a - b).abs() - largest).abs() < 1e-9 * largest, "{a} {b} {largest}");
-    // What was asked for when packing.
+    // What was asked for when packing, and what rounding to the half floats of the source adds.
     let peak = voxels["peak"].as_f64().unwrap();
-    assert!(largest <= 0.005 * peak * 1.001 && voxels["fog"].as_f64().unwrap() <= 1.001e-3 * peak);
+    assert!(largest <= 0.005 * peak + peak / 4096.0 && voxels["fog"].as_f64().unwrap() <= 1.001e-3 * peak);
     // In words.
     let said = stdout(&nuage(["diff", "--values-only", "--frames=2-4", input, &packed])).to_owned();
     let place = format!("of frame {} (", FRAMES[worst]);
