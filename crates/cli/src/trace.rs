@@ -98,11 +98,11 @@ pub(crate) fn render(
         }
         None => Ok(()),
     };
-    let (mut kept, mut trouble) = (Instant::now(), None);
+    let mut kept = Instant::now();
     let mut pass = |film: &Film| {
         if kept.elapsed() >= KEPT_EVERY {
-            // What goes wrong now goes wrong at the end as well, unless it is over by then.
-            trouble = keep(film).err();
+            // What goes wrong now goes wrong at the end as well, and is said then, unless it is over by then.
+            let _ = keep(film);
             kept = Instant::now();
         }
     };
@@ -110,7 +110,6 @@ pub(crate) fn render(
     let mut watch = Watch { cancel: Some(&CANCELLED), tile: Some(&tile), pass: Some(&mut pass) };
     let stopped = shot.trace(frame, &mut film, &mut watch);
     keep(&film)?;
-    drop(trouble);
     let mut image = shot.before_background(film.image(), frame);
     if let Some(program) = denoiser {
         image = denoise::denoise(program, &image, &film.map(Tally::albedo))?;
