@@ -1,5 +1,5 @@
 //! From a scene to a picture in one go, on all cores. Pictures of paths that grow, stop and go on are
-//! [`progressive`](crate::progressive)'s.
+//! [`progressive`]'s.
 //!
 //! Each pixel depends on its own coordinates alone, so the picture is the same for any number of threads.
 

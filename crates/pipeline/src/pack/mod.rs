@@ -4,7 +4,7 @@
 //! [`frame`] weighs what errors cost, where a ratio or a size is asked for, and then encodes each frame on its own;
 //! [`assemble`] puts frames one after the other into a file, where what they have in common stands once. [`sequence`]
 //! does one after the other. [`options`] is what is asked of it; [`append`] says how frames are added to a file that is
-//! there, [`work`] keeps what is finished for a run that is taken up again. [`level`] makes the coarser levels of a tree, [`light`] tells how much of a brick is seen,
+//! there, [`work`] keeps what is finished for a run that is taken up again. [`level`] makes the coarser levels of a tree, `light` tells how much of a brick is seen,
 //! [`unpack`] makes grids of a packed frame again.
 //!
 //! A grid becomes a channel, a vector grid three. Values keep their meaning: a level set stays one. What does not

@@ -20,7 +20,7 @@ pub struct Mie {
 }
 
 impl Mie {
-    /// The largest diameter [µm] that the fits are made for: drizzle. What lies beyond counts as this.
+    /// The largest diameter in µm that the fits are made for: drizzle. What lies beyond counts as this.
     pub const MAX_DIAMETER_UM: f32 = 50.0;
 
     /// Droplets of a mean diameter in micrometres, limited to 0..=[`MAX_DIAMETER_UM`](Self::MAX_DIAMETER_UM),
