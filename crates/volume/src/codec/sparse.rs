@@ -22,30 +22,16 @@ const BLOCK_VOXELS: usize = 8;
 /// A symbol per voxel: 0 where there is none, else its code plus 1.
 pub type Symbols = [u8; BRICK_VOXELS];
 
-/// The voxel of a brick from block and voxel of the block, both in the order of x, y and z.
-const VOXEL: [u16; BRICK_VOXELS] = {
-    let mut voxels = [0; BRICK_VOXELS];
-    let mut i = 0;
-    while i < BRICK_VOXELS {
-        let (block, voxel) = (i / BLOCK_VOXELS, i % BLOCK_VOXELS);
-        let x = (block >> 4) << 1 | voxel >> 2;
-        let y = (block >> 2 & 3) << 1 | voxel >> 1 & 1;
-        let z = (block & 3) << 1 | voxel & 1;
-        voxels[i] = (x << 6 | y << 3 | z) as u16;
-        i += 1;
-    }
-    voxels
-};
+/// The first voxel of a block, and from it to each of its voxels, both in the order of x, y and z.
+const fn first_voxel(block: usize) -> usize {
+    (block >> 4) << 7 | (block >> 2 & 3) << 4 | (block & 3) << 1
+}
+const STEPS: [usize; BLOCK_VOXELS] = [0, 1, 8, 9, 64, 65, 72, 73];
 
-/// The masks of a brick's blocks: bit `i` for voxel `i` of the block.
-fn masks(symbols: &Symbols) -> [u8; BLOCKS] {
-    let mut masks = [0; BLOCKS];
-    for (mask, voxels) in masks.iter_mut().zip(VOXEL.as_chunks::<BLOCK_VOXELS>().0) {
-        for (i, voxel) in voxels.iter().enumerate() {
-            *mask |= u8::from(symbols[usize::from(*voxel)] > 0) << i;
-        }
-    }
-    masks
+/// The symbols of a block's voxels.
+fn of_block(symbols: &Symbols, block: usize) -> [u8; BLOCK_VOXELS] {
+    let first = first_voxel(block);
+    STEPS.map(|step| symbols[first + step])
 }
 
 /// Which voxels of a brick are there: bit `y << 3 | z` of word `x`.
@@ -74,32 +60,42 @@ pub fn word_count(bits: u8, is_there: &Presence) -> usize {
 /// If `bits` is not 1 to 7.
 pub fn pack(bits: u8, symbols: &Symbols, words: &mut Vec<u32>) {
     assert!((1..=MAX_BITS).contains(&bits), "{bits} bits");
-    let masks = masks(symbols);
-    let set_of = |has: fn(u8) -> bool| (0..BLOCKS).fold(0_u64, |set, i| set | u64::from(has(masks[i])) << i);
-    for set in [set_of(|mask| mask != 0), set_of(|mask| mask == 0xff)] {
-        words.extend([set as u32, (set >> 32) as u32]);
-    }
-    let mixed: Vec<u8> = masks.into_iter().filter(|mask| *mask != 0 && *mask != 0xff).collect();
-    for bytes in mixed.chunks(4) {
-        let mut word = [0; 4];
-        word[..bytes.len()].copy_from_slice(bytes);
-        words.push(u32::from_le_bytes(word));
-    }
+    let bits = u32::from(bits);
+    let (mut some, mut all) = (0_u64, 0_u64);
+    let (mut masks, mut mixed) = ([0_u8; BLOCKS], 0);
+    let (mut codes, mut count) = ([0_u32; BRICK_VOXELS * MAX_BITS as usize / 32 + 1], 0);
     let (mut waiting, mut waiting_bits) = (0_u64, 0);
-    for voxel in VOXEL {
-        let symbol = symbols[usize::from(voxel)];
-        if symbol > 0 {
-            waiting |= u64::from(symbol - 1) << waiting_bits;
-            waiting_bits += u32::from(bits);
+    for block in 0..BLOCKS {
+        let symbols = of_block(symbols, block);
+        if symbols == [0; BLOCK_VOXELS] {
+            continue;
         }
-        if waiting_bits >= 32 {
-            words.push(waiting as u32);
-            (waiting, waiting_bits) = (waiting >> 32, waiting_bits - 32);
+        let mask = (0..BLOCK_VOXELS).fold(0, |mask, i| mask | u8::from(symbols[i] > 0) << i);
+        some |= 1 << block;
+        if mask == 0xff {
+            all |= 1 << block;
+        } else {
+            masks[mixed] = mask;
+            mixed += 1;
+        }
+        for symbol in symbols {
+            // A voxel that is not there adds nothing and takes no bits.
+            let is_there = u32::from(symbol > 0);
+            waiting |= u64::from(symbol.saturating_sub(1)) << waiting_bits;
+            waiting_bits += bits * is_there;
+            if waiting_bits >= 32 {
+                codes[count] = waiting as u32;
+                count += 1;
+                (waiting, waiting_bits) = (waiting >> 32, waiting_bits - 32);
+            }
         }
     }
-    if waiting_bits > 0 {
-        words.push(waiting as u32);
-    }
+    codes[count] = waiting as u32;
+    count += usize::from(waiting_bits > 0);
+    words.extend([some, all].iter().flat_map(|set| [*set as u32, (set >> 32) as u32]));
+    let masks = masks[..mixed.next_multiple_of(4)].as_chunks::<4>().0;
+    words.extend(masks.iter().map(|masks| u32::from_le_bytes(*masks)));
+    words.extend_from_slice(&codes[..count]);
 }
 
 /// The symbols of a brick from its words, which may be followed by others. `None` if they are not all there, or `bits` is not 1 to 7.
@@ -114,7 +110,7 @@ pub fn unpack(bits: u8, words: &[u32]) -> Option<Symbols> {
     let mut mixed = 0;
     let mut symbols = [0; BRICK_VOXELS];
     let (mut word, mut waiting, mut waiting_bits) = (0, 0_u64, 0);
-    for (block, voxels) in VOXEL.as_chunks::<BLOCK_VOXELS>().0.iter().enumerate() {
+    for block in 0..BLOCKS {
         let mask = match (all >> block & 1, some >> block & 1) {
             (1, _) => 0xff,
             (_, 0) => continue,
@@ -123,7 +119,8 @@ pub fn unpack(bits: u8, words: &[u32]) -> Option<Symbols> {
                 masks[(mixed - 1) / 4] >> ((mixed - 1) % 4 * 8) & 0xff
             }
         };
-        for (i, voxel) in voxels.iter().enumerate() {
+        let first = first_voxel(block);
+        for (i, step) in STEPS.iter().enumerate() {
             if mask >> i & 1 == 0 {
                 continue;
             }
@@ -131,7 +128,7 @@ pub fn unpack(bits: u8, words: &[u32]) -> Option<Symbols> {
                 waiting |= u64::from(*codes.get(word)?) << waiting_bits;
                 (word, waiting_bits) = (word + 1, waiting_bits + 32);
             }
-            symbols[usize::from(*voxel)] = (waiting as u8 & ((1 << bits) - 1)) + 1;
+            symbols[first + step] = (waiting as u8 & ((1 << bits) - 1)) + 1;
             (waiting, waiting_bits) = (waiting >> bits, waiting_bits - u32::from(bits));
         }
     }
