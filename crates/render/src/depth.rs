@@ -15,7 +15,7 @@ use crate::camera::Ray;
 use crate::filter::Filter;
 use crate::simd::level;
 use crate::traverse::{Field, LocalRay, Reader};
-use crate::walk::{BrickSpan, Faces, MapWalk, SpanContent, Spans};
+use crate::walk::{BrickSpan, Faces, SpanContent, Spans, with_spans};
 
 /// The cells of a brick lie at less than this, in voxels from its first corner.
 const LAST_CELL_END: f32 = 7.999_999_5;
@@ -109,16 +109,9 @@ fn stepped_on<'a, S: Simd, const NEAREST: bool>(
     let local = filter_ray::<NEAREST>(field.local(ray, start));
     let (length, step) = ((end - start) as f32, step as f32);
     let Reader { walker, blocks, .. } = reader;
-    match field.map() {
-        Some(map) => {
-            let walk = MapWalk::new(simd, map, field, walker, local, 0.0, length);
-            step_spans::<S, NEAREST>(simd, field, blocks, &local, walk, step, extinction)
-        }
-        None => {
-            let runs = field.runs(walker, local, 0.0, length);
-            step_spans::<S, NEAREST>(simd, field, blocks, &local, runs, step, extinction)
-        }
-    }
+    with_spans!(simd, field, walker, local, length, |spans| {
+        step_spans::<S, NEAREST>(simd, field, blocks, &local, spans, step, extinction)
+    })
 }
 
 #[inline(always)]
@@ -169,16 +162,9 @@ fn optical_depth_on<'a, S: Simd, const NEAREST: bool>(
     let local = filter_ray::<NEAREST>(field.local(ray, start));
     let length = (end - start) as f32;
     let Reader { walker, blocks, .. } = reader;
-    match field.map() {
-        Some(map) => {
-            let walk = MapWalk::new(simd, map, field, walker, local, 0.0, length);
-            integrate_spans::<S, NEAREST>(simd, field, blocks, &local, walk)
-        }
-        None => {
-            let runs = field.runs(walker, local, 0.0, length);
-            integrate_spans::<S, NEAREST>(simd, field, blocks, &local, runs)
-        }
-    }
+    with_spans!(simd, field, walker, local, length, |spans| {
+        integrate_spans::<S, NEAREST>(simd, field, blocks, &local, spans)
+    })
 }
 
 #[inline(always)]

@@ -1,5 +1,5 @@
-//! From a scene to a picture in one go, on all cores. Pictures of paths that grow, stop and go on are
-//! [`progressive`]'s.
+//! From a scene to a picture in one go, on all cores. Pictures of paths, which grow, are
+//! [`progressive`](crate::progressive)'s.
 //!
 //! Each pixel depends on its own coordinates alone, so the picture is the same for any number of threads.
 
@@ -7,11 +7,9 @@ use std::sync::atomic::{AtomicU32, Ordering};
 
 use glam::DVec2;
 
-use crate::film::{Film, Image, ImageSizeError, Tally, Tiling};
+use crate::film::{Image, ImageSizeError, Tiling};
 use crate::hash::{hash_pixel, unit_f32};
 use crate::march::{Marcher, Quality, Worker};
-use crate::path::PathSettings;
-use crate::progressive::{self, Plan, Watch};
 use crate::scene::Scene;
 
 /// Renders a scene by marching. The picture's alpha is 1 − transmittance; nothing stands behind the medium
@@ -46,39 +44,6 @@ pub fn render<'s>(
     };
     image.pixels = each_pixel([width, height], || marcher.worker(), pixel, progress);
     Ok(image)
-}
-
-/// A picture made of paths.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Traced {
-    /// The means over all paths of a pixel; alpha is 1 − transmittance.
-    pub image: Image,
-    /// The standard error of each mean, as far as the paths of the pixel tell; 0 where there is only one.
-    pub standard_error: Vec<[f32; 4]>,
-}
-
-/// Renders a scene by tracing `paths` paths per pixel, all in one go ([`progressive`] has the choice).
-/// Nothing stands behind the medium yet. Pictures of different seeds are independent.
-///
-/// `progress` is called with tiles done and tiles in all, from any thread.
-///
-/// # Errors
-/// If the picture has no pixels or too many.
-pub fn trace<'s>(
-    scene: &'s Scene<'s>,
-    settings: PathSettings,
-    paths: u32,
-    seed: u32,
-    [width, height]: [u32; 2],
-    progress: &(dyn Fn(u32, u32) + Sync),
-) -> Result<Traced, ImageSizeError> {
-    let mut film = Film::new(width, height)?;
-    let paths = paths.max(1);
-    let plan = Plan { settings, seed, samples: paths, pass_samples: paths, ..Plan::default() };
-    let tiles = film.tiling.count();
-    let tile = |share: f64| progress((share * f64::from(tiles)).round() as u32, tiles);
-    progressive::trace(scene, &plan, &mut film, &mut Watch { tile: Some(&tile), ..Watch::default() });
-    Ok(Traced { image: film.image(), standard_error: film.map(Tally::standard_error) })
 }
 
 /// What `pixel` makes of each pixel, row by row, on all cores. Each thread has a worker of its own.

@@ -11,7 +11,7 @@ use crate::camera::Ray;
 use crate::depth::{BrickRay, Crossings, block_of, corners_at, filter_interval, filter_ray};
 use crate::simd::level;
 use crate::traverse::{Field, LocalRay, Reader};
-use crate::walk::{BrickSpan, MapWalk, SpanContent, Spans};
+use crate::walk::{BrickSpan, SpanContent, Spans, with_spans};
 
 /// Where a ray meets a surface.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -51,16 +51,9 @@ pub fn first_hit<'a>(
     let Reader { walker, blocks, .. } = reader;
     let t = dispatch!(level(), simd => simd.vectorize(
         #[inline(always)]
-        || match field.map() {
-            Some(map) => {
-                let walk = MapWalk::new(simd, map, field, walker, local, 0.0, length);
-                meet_surface(simd, field, blocks, &local, walk, surface)
-            }
-            None => {
-                let runs = field.runs(walker, local, 0.0, length);
-                meet_surface(simd, field, blocks, &local, runs, surface)
-            }
-        }
+        || with_spans!(simd, field, walker, local, length, |spans| {
+            meet_surface(simd, field, blocks, &local, spans, surface)
+        })
     ))?;
     let slope = slope(field, blocks, local.at(t));
     // A normal turns with the transposed inverse of what turns points.
@@ -82,16 +75,9 @@ pub fn first_voxel<'a>(
     let Reader { walker, blocks, .. } = reader;
     let (t, place, value) = dispatch!(level(), simd => simd.vectorize(
         #[inline(always)]
-        || match field.map() {
-            Some(map) => {
-                let walk = MapWalk::new(simd, map, field, walker, local, 0.0, length);
-                meet_voxel(simd, field, blocks, &local, walk, above)
-            }
-            None => {
-                let runs = field.runs(walker, local, 0.0, length);
-                meet_voxel(simd, field, blocks, &local, runs, above)
-            }
-        }
+        || with_spans!(simd, field, walker, local, length, |spans| {
+            meet_voxel(simd, field, blocks, &local, spans, above)
+        })
     ))?;
     Some(VoxelHit { distance: start + f64::from(t), voxel: field.voxel_at(place), value })
 }

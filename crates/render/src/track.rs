@@ -12,7 +12,7 @@ use crate::depth::{block_of, interpolate};
 use crate::math::ln;
 use crate::simd::level;
 use crate::traverse::{Field, LocalRay, Reader};
-use crate::walk::{MapWalk, SpanContent, Spans};
+use crate::walk::{SpanContent, Spans, with_spans};
 
 /// The distance at which a ray collides with a medium of `extinction` at value 1, per world length; `None` if it passes. Over
 /// many rays the share that passes is `exp(-extinction × optical depth)`, with trilinear interpolation.
@@ -31,23 +31,15 @@ pub fn first_collision<'a>(
     let Reader { walker, blocks, .. } = reader;
     let t = dispatch!(level(), simd => simd.vectorize(
         #[inline(always)]
-        || match field.map() {
-            Some(map) => {
-                let walk = MapWalk::new(simd, map, field, walker, local, 0.0, length);
-                collide::<_>(simd, field, blocks, &local, walk, extinction, &mut random)
-            }
-            None => {
-                let runs = field.runs(walker, local, 0.0, length);
-                collide::<_>(simd, field, blocks, &local, runs, extinction, &mut random)
-            }
-        }
+        || with_spans!(simd, field, walker, local, length, |spans| {
+            collide(field, blocks, &local, spans, extinction, &mut random)
+        })
     ))?;
     Some(start + f64::from(t))
 }
 
 #[inline(always)]
-fn collide<'a, S: Simd>(
-    _simd: S,
+fn collide<'a>(
     field: &Field<'a>,
     blocks: &mut Blocks<'a>,
     local: &LocalRay,

@@ -52,6 +52,25 @@ pub(crate) struct BrickSpan {
     pub(crate) content: SpanContent,
 }
 
+/// Does something with the spans of a ray through a field: by its map of bricks if it has one, else by the tree.
+///
+/// A macro, so that the loop is made for each of the two and inlined where the vector instructions are known.
+macro_rules! with_spans {
+    ($simd:expr, $field:expr, $walker:expr, $local:expr, $length:expr, |$spans:ident| $work:expr) => {
+        match $field.map() {
+            Some(map) => {
+                let $spans = crate::walk::MapWalk::new($simd, map, $field, $walker, $local, 0.0, $length);
+                $work
+            }
+            None => {
+                let $spans = $field.runs($walker, $local, 0.0, $length);
+                $work
+            }
+        }
+    };
+}
+pub(crate) use with_spans;
+
 /// Yields the stretches of a ray that are not empty, in order.
 pub(crate) trait Spans {
     /// The next one.

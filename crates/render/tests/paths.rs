@@ -6,16 +6,37 @@
 mod reference;
 
 use glam::Vec3;
+use nuage_render::film::{Film, Image, Tally};
 use nuage_render::light::Sky;
 use nuage_render::path::PathSettings;
-use nuage_render::picture::{Traced, trace};
+use nuage_render::progressive::{self, Plan, Watch};
 use nuage_render::scene::Scene;
 use nuage_testkit::find;
 use nuage_testkit::npy::read_f32;
 use reference::{SIZE, camera, channel, json, lit_scene};
 
+/// A picture and the standard error of each of its pixels.
+#[derive(Debug, PartialEq)]
+struct Traced {
+    image: Image,
+    standard_error: Vec<[f32; 4]>,
+}
+
+fn trace(
+    scene: &Scene,
+    settings: PathSettings,
+    samples: u32,
+    seed: u32,
+    [width, height]: [u32; 2],
+) -> Traced {
+    let mut film = Film::new(width, height).expect("a picture");
+    let plan = Plan { settings, seed, samples, pass_samples: samples, ..Plan::default() };
+    progressive::trace(scene, &plan, &mut film, &mut Watch::default());
+    Traced { image: film.image(), standard_error: film.map(Tally::standard_error) }
+}
+
 fn traced(scene: &Scene, settings: PathSettings, paths: u32, seed: u32) -> Traced {
-    trace(scene, settings, paths, seed, [SIZE, SIZE], &|_, _| {}).expect("a picture")
+    trace(scene, settings, paths, seed, [SIZE, SIZE])
 }
 
 /// Holds a picture before its sky to a reference: the mean, and blocks of 8 × 8 pixels in standard errors of both.
@@ -97,8 +118,7 @@ fn a_furnace_is_white() {
 fn seeds_are_independent_and_threads_change_nothing() {
     let (json, density) = (json(), channel("density"));
     let scene = lit_scene(&json, &density, 0.3);
-    let small =
-        |seed| trace(&scene, PathSettings::default(), 4, seed, [40, 24], &|_, _| {}).expect("a picture");
+    let small = |seed| trace(&scene, PathSettings::default(), 4, seed, [40, 24]);
     let first = small(1);
     assert_ne!(first, small(2));
     let one = rayon::ThreadPoolBuilder::new().num_threads(1).build().expect("a pool").install(|| small(1));
