@@ -345,8 +345,8 @@ fn render_frame(
     let rendered = start.elapsed();
     // What was there is replaced only if that was asked for when it was found.
     write_whole(&job.output, &bytes, job.replaces).map_err(|e| plain(&job.output, e))?;
-    if let Some(Traced { samples, noise, stopped, .. }) = traced
-        && (run.timing || stopped == Stopped::Cancelled)
+    if let Some(Traced { samples, noise, stopped, .. }) = &traced
+        && (run.timing || *stopped == Stopped::Cancelled)
     {
         let why = match stopped {
             Stopped::Samples => "",
@@ -365,7 +365,7 @@ fn render_frame(
             (start.elapsed() - rendered).as_secs_f64() * 1e3
         ));
     }
-    Ok(())
+    traced.map_or(Ok(()), |traced| traced.kept)
 }
 
 /// The volumes of some frames.

@@ -58,6 +58,8 @@ pub(crate) fn checkpoint_path(picture: &Path) -> PathBuf {
 pub(crate) struct Traced {
     /// The file of it.
     pub(crate) bytes: Vec<u8>,
+    /// Whether its film was kept, if it was to be. The picture is not lost with it.
+    pub(crate) kept: Result<(), Failure>,
     /// Why it ended.
     pub(crate) stopped: Stopped,
     /// The fewest paths of a pixel.
@@ -69,7 +71,7 @@ pub(crate) struct Traced {
 /// Renders a frame. `denoiser` is the program that takes noise away, if one is to.
 ///
 /// # Errors
-/// If a checkpoint is of something else or cannot be written, the denoiser fails, or the picture cannot be encoded.
+/// If a checkpoint is of something else, the denoiser fails, or the picture cannot be encoded.
 pub(crate) fn render(
     run: &RunKeys,
     shot: &Shot,
@@ -109,7 +111,7 @@ pub(crate) fn render(
     let tile = |share: f64| progress((share.clamp(0.0, 1.0) * 1000.0) as u32, 1000);
     let mut watch = Watch { cancel: Some(&CANCELLED), tile: Some(&tile), pass: Some(&mut pass) };
     let stopped = shot.trace(frame, &mut film, &mut watch);
-    keep(&film)?;
+    let kept = keep(&film);
     let mut image = shot.before_background(film.image(), frame);
     if let Some(program) = denoiser {
         image = denoise::denoise(program, &image, &film.map(Tally::albedo))?;
@@ -125,7 +127,7 @@ pub(crate) fn render(
     };
     let bytes = bytes.map_err(|e| failed(e.to_string()))?;
     let [samples, _] = film.samples();
-    Ok(Traced { bytes, stopped, samples, noise: film.noise() })
+    Ok(Traced { bytes, kept, stopped, samples, noise: film.noise() })
 }
 
 /// Stands for all that the paths of a frame depend on, and nothing that they do not.

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 
 use nuage_testkit as testkit;
+use nuage_testkit::blocks::{Estimate, hold};
 use nuage_testkit::npy::{read_f32, read_raw_f64};
 
 const SIDE: usize = 128;
@@ -74,46 +75,24 @@ fn pictures(name: &str, seeds: u32, options: &[&str]) -> Vec<Pixels> {
     (0..seeds).map(picture).collect()
 }
 
-/// Holds a scene to its answer, three values per pixel with their standard errors: the mean, and blocks of 8 × 8 pixels in
-/// standard errors of both. Each of the pictures of `seeds` has `samples` paths per pixel.
+/// Holds a scene to its answer, three values per pixel with their standard errors. Each of the pictures of `seeds` has `samples`
+/// paths per pixel.
 fn holds(name: &str, seeds: u32, samples: &str, expected: &[f64], stderr: &[f64]) {
     let pictures = pictures(name, seeds, &["--samples", samples]);
     let count = f64::from(seeds);
-    let (mut good, mut blocks, mut worst) = (0, 0, 0.0_f64);
     for colour in 0..3 {
-        let each = |i: usize| pictures.iter().map(move |picture| f64::from(picture[i][colour]));
-        let ours = |i: usize| each(i).sum::<f64>() / count;
-        let variance = |i: usize| {
-            let mean = ours(i);
-            each(i).map(|value| (value - mean).powi(2)).sum::<f64>() / (count * (count - 1.0))
+        let ours = |i: usize| {
+            let each = || pictures.iter().map(|picture| f64::from(picture[i][colour]));
+            let mean = each().sum::<f64>() / count;
+            let variance = each().map(|value| (value - mean).powi(2)).sum::<f64>() / (count * (count - 1.0));
+            Estimate { mean, variance }
         };
-        let theirs = |i: usize| expected[3 * i + colour];
-        let both = |i: usize| variance(i) + stderr[3 * i + colour].powi(2);
-        let sum = |f: &dyn Fn(usize) -> f64| (0..PIXELS).map(f).sum::<f64>() / PIXELS as f64;
-        let (found, expected) = (sum(&ours), sum(&theirs));
-        let error = (sum(&both) / PIXELS as f64).sqrt();
-        let off = (found - expected).abs();
-        println!("{name} {colour}: {found:.5} of {expected:.5}, {:+.3} %", 100.0 * (found / expected - 1.0));
-        assert!(off <= 0.005 * expected && off <= 3.0 * error + 0.001 * expected, "{name}: {off} {error}");
-        for block in 0..PIXELS / 64 {
-            let first = block / 16 * 8 * SIDE + block % 16 * 8;
-            let block = |f: &dyn Fn(usize) -> f64| {
-                (0..64).map(|i| f(first + i / 8 * SIDE + i % 8)).sum::<f64>() / 64.0
-            };
-            let difference = (block(&ours) - block(&theirs)).abs();
-            let z = difference / (block(&both) / 64.0 + 1e-6 * block(&theirs).powi(2)).sqrt();
-            // Where nothing is, both are 0.
-            let z = if difference == 0.0 { 0.0 } else { z };
-            good += u32::from(z < 3.0);
-            blocks += 1;
-            worst = worst.max(z);
-        }
+        let theirs =
+            |i: usize| Estimate { mean: expected[3 * i + colour], variance: stderr[3 * i + colour].powi(2) };
+        let ours: Vec<Estimate> = (0..PIXELS).map(ours).collect();
+        let theirs: Vec<Estimate> = (0..PIXELS).map(theirs).collect();
+        hold(&format!("{name} {colour}"), SIDE, &ours, &theirs);
     }
-    println!("{name}: {good} of {blocks} blocks within 3 standard errors, the worst {worst:.2}");
-    assert!(
-        f64::from(good) >= 0.99 * f64::from(blocks) && worst < 5.0,
-        "{name}: {good} of {blocks}, {worst}"
-    );
 }
 
 /// Holds a scene to converged pictures of another renderer.

@@ -85,6 +85,15 @@ fn a_picture_that_was_kept_becomes_the_one_that_was_never_stopped() {
     let out = run(&kept, "--spp 9 --checkpoint --resume");
     assert!(String::from_utf8(out.stderr).unwrap().contains("damaged"));
     assert_eq!(fs::read(&kept).unwrap(), before);
+
+    // What cannot be kept is said, but the picture is there.
+    fs::remove_file(&checkpoint).unwrap();
+    fs::create_dir(&checkpoint).unwrap();
+    fs::remove_file(&kept).unwrap();
+    let out = run(&kept, "--spp 5 --checkpoint");
+    let said = String::from_utf8(out.stderr).unwrap();
+    assert!(out.status.code() == Some(1) && said.contains("kept.exr.checkpoint"), "{said}");
+    assert_eq!(fs::read(&kept).unwrap(), fs::read(&whole).unwrap());
 }
 
 #[test]

@@ -5,12 +5,14 @@
 //! Nothing here is part of the product.
 
 #![allow(clippy::print_stderr, reason = "tests report what they leave out")]
+#![allow(clippy::print_stdout, reason = "the measured errors are worth reading")]
 
 use std::env;
 use std::path::{Path, PathBuf};
 
 use serde_json::Value;
 
+pub mod blocks;
 pub mod npy;
 pub mod synthetic;
 

@@ -20,6 +20,16 @@ pub struct Target {
     pub words: Option<u64>,
 }
 
+impl Target {
+    /// What a part of the bricks has to keep to.
+    pub fn of_part(self, part: f64) -> Target {
+        Target {
+            squared_error: self.squared_error.map(|squared| part * squared),
+            words: self.words.map(|words| (part * words as f64) as u64),
+        }
+    }
+}
+
 /// How λ is stepped: so many steps double it.
 const STEPS_PER_OCTAVE: i32 = 16;
 /// The first and last step. Beyond, λ makes no difference.

@@ -12,7 +12,7 @@ use fearless_simd::{Level, Simd, dispatch};
 use half::f16;
 use nuage_volume::codec::{
     BrickContext, Codec, LATTICE_POINTS, Line, codes, interpolate_corners, interpolate_lattice, lattice_cell,
-    octant_lines,
+    octant_lines, sparse,
 };
 use nuage_volume::space::BRICK_VOXELS;
 
@@ -116,12 +116,9 @@ impl<'a> Measure<'a> {
     /// The codecs to be tried unless one is asked for, the cheapest first. The last can hold any brick.
     pub fn codecs(&self) -> impl Iterator<Item = Codec> + use<> {
         let sparse = self.sparse.as_ref().map_or(Vec::new(), |sparse| sparse.codecs(self.values, self.scale));
-        // Where much is empty, codes for all voxels do not pay.
-        let is_tried = match self.sparse.as_ref().is_some_and(Sparse::is_mostly_empty) {
-            true => |codec: &Codec| !has_codes(*codec),
-            false => |_: &Codec| true,
-        };
-        let others = CODECS.into_iter().filter(is_tried);
+        // Where some is empty, codes for all voxels hardly pay.
+        let is_sparse = self.sparse.as_ref().is_some_and(Sparse::has_gaps);
+        let others = CODECS.into_iter().filter(move |codec| !is_sparse || !is_like_sparse(*codec));
         let (mut sparse, mut others) = (sparse.into_iter().peekable(), others.peekable());
         std::iter::from_fn(move || match (sparse.peek(), others.peek()) {
             (Some(one), Some(other)) if one.word_count() < other.word_count() => sparse.next(),
@@ -171,13 +168,11 @@ impl<'a> Measure<'a> {
     }
 }
 
-/// Whether a codec has codes of two bits or more for all voxels.
-fn has_codes(codec: Codec) -> bool {
+/// Whether a codec has codes, for all voxels, that sparse bricks have as well.
+fn is_like_sparse(codec: Codec) -> bool {
     match codec {
-        Codec::Uniform { bits }
-        | Codec::Gradient { bits }
-        | Codec::Lattice { bits }
-        | Codec::Split { bits } => bits > 1,
+        Codec::Uniform { bits } | Codec::Gradient { bits } => bits <= sparse::MAX_BITS,
+        Codec::Lattice { .. } | Codec::Split { .. } => true,
         _ => false,
     }
 }
@@ -407,7 +402,7 @@ fn rows_of(quadrant: usize) -> impl Iterator<Item = usize> {
 }
 
 /// The lines of two octants, by voxel of a row across them.
-struct RowLines {
+pub(super) struct RowLines {
     low: [f32; ROW],
     step: [f32; ROW],
     /// One over the step.
@@ -424,9 +419,21 @@ impl RowLines {
         }
     }
 
+    /// One line for all voxels.
+    pub(super) fn of_one(line: Line) -> RowLines {
+        RowLines::new(&[line; 8], 0)
+    }
+
+    /// The value that a code leads to.
+    #[inline(always)]
+    pub(super) fn decoded(&self, z: usize, code: f32, predicted: f32, floor: f32) -> f32 {
+        let decoded = predicted + (self.low[z] + self.step[z] * code);
+        if decoded < floor { floor } else { decoded }
+    }
+
     /// The code of a voxel, as a float.
     #[inline(always)]
-    fn code(&self, z: usize, value: f32, predicted: f32, last_code: f32, floor: f32) -> f32 {
+    pub(super) fn code(&self, z: usize, value: f32, predicted: f32, last_code: f32, floor: f32) -> f32 {
         /// Adding and taking away this rounds a float below 2²² to the nearest whole number.
         const ROUNDING: f32 = 12_582_912.0;
         let exact = (value - predicted - self.low[z]) * self.inverse[z];
@@ -442,7 +449,7 @@ fn inverse(line: Line) -> f32 {
     if line.step > 0.0 { 1.0 / line.step } else { 0.0 }
 }
 
-fn last_code(bits: u8) -> f32 {
+pub(super) fn last_code(bits: u8) -> f32 {
     f32::from((1_u16 << bits) - 1)
 }
 
@@ -474,7 +481,7 @@ fn error(values: &Brick, given: &Brick, scale: &ChannelScale) -> Option<Error> {
 }
 
 /// The error of the values that the codes of a brick lead to. `None` if an empty voxel is not empty or a sign changed.
-pub(super) fn quantized_error(
+fn quantized_error(
     values: &Brick,
     predicted: &Brick,
     lines: &[Line; 8],
@@ -511,8 +518,7 @@ fn quantized_error_on(
             for z in 0..ROW {
                 let (value, predicted) = (values[z], predicted[z]);
                 let code = lines.code(z, value, predicted, last_code, floor);
-                let decoded = predicted + (lines.low[z] + lines.step[z] * code);
-                let decoded = if decoded < floor { floor } else { decoded };
+                let decoded = lines.decoded(z, code, predicted, floor);
                 let error = (decoded - value).abs() * inverse_unit;
                 squared[z] += error * error;
                 max[z] = if error > max[z] { error } else { max[z] };

@@ -260,6 +260,55 @@ pub fn settle(totals: &Totals, planned: &ChannelPlan, options: &Options) -> Lamb
     }
 }
 
+/// A λ with which a channel is sure to meet what is asked of it.
+pub fn sure_lambda(planned: &ChannelPlan, options: &Options) -> Lambda {
+    let sure = match target(planned, options).squared_error {
+        Some(squared) => Lambda::sure(planned.bricks, squared),
+        None => Lambda::LARGEST,
+    };
+    planned.before.map_or(sure, |before| sure.max(before.lambda))
+}
+
+/// A λ is guessed from so many bricks of a channel, or some more, in at most so many frames.
+const GUESS_BRICKS: usize = 1024;
+const GUESS_FRAMES: usize = 16;
+
+/// How much more the λ of all bricks may be than that of some.
+const GUESS_MARGIN: f64 = 2.0;
+
+/// A λ for each channel that is likely to do, from some bricks of some frames. It saves trying what only a larger one asks for.
+///
+/// # Errors
+/// If a grid is not in the plan.
+pub fn likely_lambdas(
+    frames: &[&[Grid]],
+    plan: &Plan,
+    options: &Options,
+) -> Result<Vec<Lambda>, EncodeError> {
+    let sure: Vec<Lambda> = plan.channels.iter().map(|planned| sure_lambda(planned, options)).collect();
+    let mut found = vec![(Totals::default(), 0_u64); sure.len()];
+    let some: Vec<&[Grid]> =
+        frames.iter().step_by(frames.len().div_ceil(GUESS_FRAMES).max(1)).copied().collect();
+    let bricks = plan.channels.iter().map(|planned| planned.bricks as usize).max().unwrap_or(0);
+    let every = (bricks * some.len() / frames.len().max(1) / GUESS_BRICKS).max(1);
+    for weighed in each(some.len(), |i| weigh_frame(some[i], plan, options, &sure, every)) {
+        for WeighedChannel { channel, totals, curves } in weighed? {
+            found[channel].0.merge(&totals);
+            found[channel].1 += curves.len() as u64;
+        }
+    }
+    let guess = |((planned, sure), (totals, bricks)): ((&ChannelPlan, Lambda), (Totals, u64))| {
+        if bricks == 0 {
+            return sure;
+        }
+        let part = bricks as f64 / planned.bricks as f64;
+        let guess = totals.lambda(&target(planned, options).of_part(part));
+        let least = planned.before.map_or(Lambda::NONE, |before| before.lambda);
+        Lambda::of_weight(sure.weight().min(GUESS_MARGIN * guess.weight())).max(least)
+    };
+    Ok(plan.channels.iter().zip(sure).zip(found).map(guess).collect())
+}
+
 /// Finds the shapes of each channel, in bricks of some frames of the sequence. A codec that is asked for has none.
 pub fn find_shapes(frames: &[&[Grid]], plan: &mut Plan, options: &Options) {
     for planned in &mut plan.channels {
@@ -297,7 +346,7 @@ pub struct WeighedChannel {
     pub curves: Vec<Curve>,
 }
 
-/// Finds what each λ would lead to in a frame.
+/// Finds what each λ up to the `largest` of a channel would lead to in a frame, in each brick or each so many.
 ///
 /// # Errors
 /// If a grid is not in the plan.
@@ -305,22 +354,19 @@ pub fn weigh_frame(
     grids: &[Grid],
     plan: &Plan,
     options: &Options,
+    largest: &[Lambda],
+    every: usize,
 ) -> Result<Vec<WeighedChannel>, EncodeError> {
     let weigh = |tree: ChannelTree| {
         let index = plan.find(&tree.key).ok_or_else(|| EncodeError::NotPlanned(tree.key.grid.clone()))?;
-        let planned = &plan.channels[index];
-        let largest = match target(planned, options).squared_error {
-            Some(squared) => Lambda::sure(planned.bricks, squared),
-            None => Lambda::LARGEST,
-        };
-        let largest = planned.before.map_or(largest, |before| largest.max(before.lambda));
-        let choice = Choice::new(planned, options, tree.tree.background, largest);
+        let choice = Choice::new(&plan.channels[index], options, tree.tree.background, largest[index]);
         if choice.asked.is_some() {
             return Ok(WeighedChannel { channel: index, totals: Totals::default(), curves: Vec::new() });
         }
         let level = Level::of(&tree.tree, IVec3::ZERO);
         let weights = choice.weights(&level);
-        let curves = each(level.bricks.len(), |i| choice.curve(&level.bricks[i], weights[i]));
+        let curve = |i: usize| choice.curve(&level.bricks[i * every], weights[i * every]);
+        let curves = each(level.bricks.len().div_ceil(every), curve);
         // In the order of bricks, on which sums depend.
         let mut totals = Totals::default();
         curves.iter().for_each(|curve| totals.add(curve));

@@ -13,13 +13,14 @@ use nuage_volume::format::Asset;
 use super::append;
 use super::assemble::{AssembleError, Assembler, Report};
 use super::frame::{
-    EncodeError, EncodedFrame, WeighedChannel, encode_frame, find_shapes, settle, weigh_frame,
+    EncodeError, EncodedFrame, WeighedChannel, encode_frame, find_shapes, likely_lambdas, settle,
+    sure_lambda, weigh_frame,
 };
 use super::options::{NoSuchChannel, Options};
 use super::plan::Plan;
 use super::work::{self, Keep, Recipe};
 use crate::each;
-use crate::encode::choose::Totals;
+use crate::encode::choose::{Lambda, Totals};
 
 /// A frame's number, if it has one, and the name of its source.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -204,26 +205,45 @@ fn survey<E: Send>(
         kept.iter().filter_map(|kept| Some(kept.loaded.as_ref()?.0.as_slice())).collect();
     find_shapes(&samples, &mut plan, options);
     if options.is_weighed() {
-        let mut sums: Vec<Totals> = plan.channels.iter().map(|_| Totals::default()).collect();
-        for window in windows(kept.len()) {
-            let weighed = each(window.len(), |i| -> Result<_, PackError<E>> {
-                let frame = window.start + i;
-                Ok(weigh_frame(&loaded(load, &kept[frame], frame)?.0, &plan, options)?)
-            });
-            for (frame, weighed) in window.clone().zip(weighed) {
-                let weighed = weighed?;
-                weighed.iter().for_each(|found| sums[found.channel].merge(&found.totals));
-                if kept[frame].loaded.is_some() {
-                    kept[frame].weighed = Some(weighed);
-                }
-            }
-            tell(window.len());
+        let likely = likely_lambdas(&samples, &plan, options)?;
+        let mut lambdas = weigh(load, kept, &plan, options, &likely, tell)?;
+        if lambdas.iter().zip(&likely).any(|(lambda, likely)| lambda > likely) {
+            let sure: Vec<Lambda> =
+                plan.channels.iter().map(|planned| sure_lambda(planned, options)).collect();
+            lambdas = weigh(load, kept, &plan, options, &sure, &mut |_| {})?;
         }
-        for (channel, sum) in plan.channels.iter_mut().zip(sums) {
-            channel.lambda = settle(&sum, channel, options);
+        for (channel, lambda) in plan.channels.iter_mut().zip(lambdas) {
+            channel.lambda = lambda;
         }
     }
     Ok(plan)
+}
+
+/// The λ of each channel over all frames, as long as it is no more than the `largest`; else one that is more. Keeps what was found of frames that are kept.
+fn weigh<E: Send>(
+    load: &(impl Fn(usize) -> Result<Loaded, E> + Sync),
+    kept: &mut [Kept],
+    plan: &Plan,
+    options: &Options,
+    largest: &[Lambda],
+    tell: &mut impl FnMut(usize),
+) -> Result<Vec<Lambda>, PackError<E>> {
+    let mut sums: Vec<Totals> = plan.channels.iter().map(|_| Totals::default()).collect();
+    for window in windows(kept.len()) {
+        let weighed = each(window.len(), |i| -> Result<_, PackError<E>> {
+            let frame = window.start + i;
+            Ok(weigh_frame(&loaded(load, &kept[frame], frame)?.0, plan, options, largest, 1)?)
+        });
+        for (frame, weighed) in window.clone().zip(weighed) {
+            let weighed = weighed?;
+            weighed.iter().for_each(|found| sums[found.channel].merge(&found.totals));
+            if kept[frame].loaded.is_some() {
+                kept[frame].weighed = Some(weighed);
+            }
+        }
+        tell(window.len());
+    }
+    Ok(plan.channels.iter().zip(sums).map(|(channel, sum)| settle(&sum, channel, options)).collect())
 }
 
 /// Does two things, at the same time where the feature `parallel` says so.

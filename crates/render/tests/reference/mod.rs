@@ -1,10 +1,18 @@
 //! The scenes with known answers: their camera, grids and lights.
 
+use std::convert::Infallible;
+use std::io::Cursor;
+
 use glam::DVec3;
+use nuage_pipeline::pack::options::Options;
+use nuage_pipeline::pack::sequence::{FrameName, pack};
+use nuage_pipeline::pack::unpack::unpack_frame;
 use nuage_render::camera::Camera;
 use nuage_render::light::Sun;
 use nuage_render::scene::{Phase, Scene, Shape, Volume};
+use nuage_vdb::{Grid, Metadata};
 use nuage_volume::channel::Channel;
+use nuage_volume::format::Asset;
 use serde_json::Value;
 
 /// Pixels per side of every reference picture.
@@ -32,11 +40,28 @@ pub(crate) fn camera(json: &Value) -> Camera {
     Camera::look_at(vector("origin"), vector("target"), vector("up"), fov).expect("a view")
 }
 
-pub(crate) fn channel(name: &str) -> Channel {
+fn grid(name: &str) -> Grid {
     let bytes = std::fs::read(path("oracle_64.vdb")).expect("readable");
     let file = nuage_vdb::File::open(bytes).expect("a VDB file");
-    let grid = file.read_grid(file.find(name).expect("the grid")).expect("an intact grid");
-    nuage_pipeline::import::import(grid).expect("a linear transform").0
+    file.read_grid(file.find(name).expect("the grid")).expect("an intact grid")
+}
+
+pub(crate) fn channel(name: &str) -> Channel {
+    nuage_pipeline::import::import(grid(name)).expect("a linear transform").0
+}
+
+/// The same as it comes back from a packed file.
+#[allow(dead_code, reason = "not every test binary takes packed values")]
+pub(crate) fn packed_channel(name: &str) -> Channel {
+    let frames = [FrameName { number: None, name: name.to_owned() }];
+    let load = |_| Ok::<_, Infallible>((vec![grid(name)], Metadata::default()));
+    let mut bytes = Cursor::new(Vec::new());
+    let options = Options { psnr: Some(40.0), ..Options::default() };
+    pack(&frames, load, &mut bytes, &options, None, &mut |_| ()).expect("a packed file");
+    let mut asset = Asset::open(bytes.into_inner()).expect("a sound file");
+    asset.load_frame(0).expect("sound bricks");
+    let (mut grids, _) = unpack_frame(&asset, 0).expect("a frame");
+    nuage_pipeline::import::import(grids.remove(0)).expect("a linear transform").0
 }
 
 pub(crate) fn lit_scene<'a>(json: &Value, density: &'a Channel, phase_g: f32) -> Scene<'a> {
