@@ -13,8 +13,8 @@ use crate::encode::seen::Light;
 
 const BRICK_SIDE: usize = 8;
 
-/// The optical depth of the denser rays along an axis. `nuage render` takes the same where it is told nothing.
-const OPTICAL_DEPTH: f32 = 8.0;
+/// The optical depth of the denser columns of cells: about as much as `nuage render` has where it is told nothing.
+const OPTICAL_DEPTH: f32 = 9.5;
 
 /// The part of rays that are less dense than these.
 const DENSER: f32 = 0.9;
