@@ -31,7 +31,7 @@ impl Target {
 }
 
 /// How λ is stepped: so many steps double it.
-const STEPS_PER_OCTAVE: i32 = 16;
+const STEPS_PER_OCTAVE: i32 = 64;
 /// The first and last step. Beyond, λ makes no difference.
 const FIRST_STEP: i32 = -8 * STEPS_PER_OCTAVE;
 const LAST_STEP: i32 = 40 * STEPS_PER_OCTAVE;

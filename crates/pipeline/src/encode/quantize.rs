@@ -17,6 +17,7 @@ use nuage_volume::codec::{
 use nuage_volume::space::BRICK_VOXELS;
 
 use super::block;
+use super::seen::{Light, Seen};
 use super::shapes::{SHAPE_CODEC, Shapes, Shared};
 use super::sparse::Sparse;
 
@@ -98,6 +99,8 @@ pub struct Measure<'a> {
     lattice: Option<(Prediction<LATTICE_POINTS>, Range)>,
     /// The voxels that are there, if some are not.
     sparse: Option<Sparse>,
+    /// What is seen of errors, if they count by that.
+    seen: Option<Seen<'a>>,
 }
 
 impl<'a> Measure<'a> {
@@ -105,7 +108,12 @@ impl<'a> Measure<'a> {
     pub fn of(values: &'a Brick, scale: &'a ChannelScale, shapes: &'a Shapes) -> Self {
         let range = Range::of_residuals(values, &NOTHING, scale);
         let sparse = Sparse::of(values, scale);
-        Measure { values, scale, shapes, range, gradient: None, lattice: None, sparse }
+        Measure { values, scale, shapes, range, gradient: None, lattice: None, sparse, seen: None }
+    }
+
+    /// Begins with a brick in which errors count by what is seen of them.
+    pub fn in_light(values: &'a Brick, scale: &'a ChannelScale, shapes: &'a Shapes, light: &Light) -> Self {
+        Measure { seen: Some(Seen::of(values, scale, light)), ..Measure::of(values, scale, shapes) }
     }
 
     /// How the brick is written.
@@ -115,7 +123,11 @@ impl<'a> Measure<'a> {
 
     /// The codecs to be tried unless one is asked for, the cheapest first. The last can hold any brick.
     pub fn codecs(&self) -> impl Iterator<Item = Codec> + use<> {
-        let sparse = self.sparse.as_ref().map_or(Vec::new(), |sparse| sparse.codecs(self.values, self.scale));
+        let sparse = match (&self.seen, &self.sparse) {
+            (Some(seen), _) => seen.codecs(),
+            (None, Some(sparse)) => sparse.codecs(self.values, self.scale),
+            (None, None) => Vec::new(),
+        };
         // Where some is empty, codes for all voxels hardly pay.
         let is_sparse = self.sparse.as_ref().is_some_and(Sparse::has_gaps);
         let others = CODECS.into_iter().filter(move |codec| !is_sparse || !is_like_sparse(*codec));
@@ -129,7 +141,37 @@ impl<'a> Measure<'a> {
     /// The error in a codec, `None` where it cannot hold the brick: empty voxels would not stay empty, a sign would
     /// change, or no shape is like it. [`Codec::F32`] always can.
     pub fn error(&mut self, codec: Codec) -> Option<Error> {
-        let Measure { values, scale, shapes, range, ref mut gradient, ref mut lattice, ref sparse } = *self;
+        if self.seen.is_none() {
+            return self.plain_error(codec);
+        }
+        if let (Some(seen), Codec::Sparse { pairs, .. }) = (&self.seen, codec) {
+            return seen.sparse_error(pairs);
+        }
+        let error = self.plain_error(codec)?;
+        let seen = self.seen.as_ref()?.of_values(&self.decoded(codec)?);
+        Some(Error { bias: seen - error.squared, ..error })
+    }
+
+    /// The values that a codec leads to.
+    fn decoded(&self, codec: Codec) -> Option<Brick> {
+        Some(match codec {
+            Codec::Constant => [constant(self.values, self.scale); BRICK_VOXELS],
+            Codec::Shared => {
+                let (_, shared) = best_shared(self.values, self.scale, self.shapes)?;
+                self.shapes.values(&shared)
+            }
+            codec => {
+                let (mut words, mut decoded) = (Vec::new(), NOTHING);
+                write(self.values, codec, self.scale, self.shapes, &mut words);
+                decode(codec, &words, self.scale, &mut decoded).then_some(decoded)?
+            }
+        })
+    }
+
+    /// The error in a codec without regard to what is seen of it.
+    fn plain_error(&mut self, codec: Codec) -> Option<Error> {
+        let Measure { values, scale, shapes, range, ref mut gradient, ref mut lattice, ref sparse, .. } =
+            *self;
         match codec {
             Codec::Constant => {
                 let line = Line { low: constant(values, scale), step: 0.0 };
@@ -315,7 +357,7 @@ pub(super) struct StoredLine {
 
 impl StoredLine {
     /// The line of codes up to `last_code` that covers `min` to `max`: half floats, rounded outward.
-    fn covering(min: f32, max: f32, last_code: u32, unit: f32) -> StoredLine {
+    pub(super) fn covering(min: f32, max: f32, last_code: u32, unit: f32) -> StoredLine {
         let low = half_not_above(min / unit);
         let step = half_not_below((max / unit - low.to_f32()) / last_code as f32);
         let word = u32::from(low.to_bits()) | u32::from(step.to_bits()) << 16;

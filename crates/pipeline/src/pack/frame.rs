@@ -20,6 +20,7 @@ use super::plan::{ChannelPlan, ChannelTree, Plan, channel_trees};
 use crate::each;
 use crate::encode::choose::{Candidate, Curve, Lambda, Target, Totals};
 use crate::encode::quantize::{Brick, ChannelScale, Error, Measure, constant, write};
+use crate::encode::seen::{Light, Seen};
 use crate::encode::shapes::{SAMPLE_BRICKS, Shapes};
 use crate::import::linear_transform;
 
@@ -195,30 +196,36 @@ impl Choice {
         let max_error = options.max_error.map_or(f32::INFINITY, |bound| bound.of(planned.peak()));
         let scale = ChannelScale { max_error, ..planned.scale(background) };
         // A budget goes where it shows. A bound of the error is one for all voxels.
-        let is_lit =
-            options.bits_per_voxel.is_some() && options.psnr.is_none() && planned.role == Role::Density;
+        let is_lit = options.codec.is_none()
+            && options.bits_per_voxel.is_some()
+            && options.psnr.is_none()
+            && planned.role == Role::Density;
         Choice { asked: options.codec, scale, lambda, shapes, is_lit }
     }
 
-    /// How much the errors of each brick count.
-    fn weights(&self, level: &Level) -> Vec<f64> {
-        if self.is_lit { light::weights(level) } else { vec![1.0; level.bricks.len()] }
+    /// The light in each brick, if errors count by it.
+    fn light(&self, level: &Level) -> Option<Vec<Light>> {
+        self.is_lit.then(|| light::light(level))
     }
 
     /// The codecs that are the best for a brick with some λ up to that of the choice.
-    fn curve(&self, brick: &Brick, weight: f64) -> Curve {
-        Curve::of(&mut Measure::of(brick, &self.scale, &self.shapes), weight, self.lambda)
+    fn curve(&self, brick: &Brick, light: Option<&Light>) -> Curve {
+        let mut measure = match light {
+            Some(light) => Measure::in_light(brick, &self.scale, &self.shapes, light),
+            None => Measure::of(brick, &self.scale, &self.shapes),
+        };
+        Curve::of(&mut measure, 1.0, self.lambda)
     }
 
-    fn best(&self, brick: &Brick, weight: f64) -> Candidate {
+    fn best(&self, brick: &Brick, light: Option<&Light>) -> Candidate {
         let Some(asked) = self.asked else {
-            return self.curve(brick, weight).at(self.lambda);
+            return self.curve(brick, light).at(self.lambda);
         };
         let mut measure = Measure::of(brick, &self.scale, &self.shapes);
         let mut held = [asked, Codec::Uniform { bits: 8 }]
             .into_iter()
-            .filter_map(|codec| Some(Candidate::new(codec, measure.error(codec)?, weight)));
-        held.next().unwrap_or(Candidate::new(Codec::F32, Error::default(), weight))
+            .filter_map(|codec| Some(Candidate::new(codec, measure.error(codec)?, 1.0)));
+        held.next().unwrap_or(Candidate::new(Codec::F32, Error::default(), 1.0))
     }
 }
 
@@ -364,8 +371,9 @@ pub fn weigh_frame(
             return Ok(WeighedChannel { channel: index, totals: Totals::default(), curves: Vec::new() });
         }
         let level = Level::of(&tree.tree, IVec3::ZERO);
-        let weights = choice.weights(&level);
-        let curve = |i: usize| choice.curve(&level.bricks[i * every], weights[i * every]);
+        let light = choice.light(&level);
+        let light_in = |i: usize| light.as_ref().and_then(|light| light.get(i));
+        let curve = |i: usize| choice.curve(&level.bricks[i * every], light_in(i * every));
         let curves = each(level.bricks.len().div_ceil(every), curve);
         // In the order of bricks, on which sums depend.
         let mut totals = Totals::default();
@@ -378,15 +386,21 @@ pub fn weigh_frame(
 /// Encodes the bricks of a level, by their curves if these are known. Gives the sum of their squared errors, in units
 /// of the channel, and the largest error as well.
 fn encode_level(level: &Level, choice: &Choice, curves: Option<&[Curve]>) -> (EncodedLevel, Error) {
-    let weights = if curves.is_none() { choice.weights(level) } else { Vec::new() };
+    let light = choice.light(level);
+    let light_in = |i: usize| light.as_ref().and_then(|light| light.get(i));
     let coded = each(level.bricks.len(), |i| {
         let brick = &level.bricks[i];
         let best = match curves {
             Some(curves) if choice.asked.is_none() => curves[i].at(choice.lambda),
-            _ => choice.best(brick, weights.get(i).copied().unwrap_or(1.0)),
+            _ => choice.best(brick, light_in(i)),
         };
         let mut words = Vec::with_capacity(best.codec.word_count());
-        write(brick, best.codec, &choice.scale, &choice.shapes, &mut words);
+        match (best.codec, light_in(i)) {
+            (Codec::Sparse { pairs, .. }, Some(light)) => {
+                Seen::of(brick, &choice.scale, light).write(pairs, &mut words);
+            }
+            (codec, _) => write(brick, codec, &choice.scale, &choice.shapes, &mut words),
+        }
         (best, words)
     });
     let mut encoded = EncodedLevel { tiles: level.tiles.clone(), ..EncodedLevel::default() };

@@ -1,19 +1,20 @@
 //! How much of what a brick holds can be seen: where light hardly gets, errors hardly matter.
 //!
 //! A budget of words is best spent where it shows. Nothing is known here of cameras and lights, so what counts is the light that
-//! gets from a brick to the outside in 26 directions, through cells of a few voxels taken as homogeneous, in a medium so dense
-//! that a good part of it is hidden. An error shows in the light that is scattered there and comes out as it came in, so it weighs
-//! by the square.
+//! gets from the outside to a place and back out, on the way of any of 26 directions, through cells of a few voxels taken as
+//! homogeneous, in a medium so dense that a good part of it is hidden. What errors then count is the encoder's
+//! ([`seen`](crate::encode::seen)).
 
 use glam::IVec3;
 use nuage_volume::build::TileSize;
 
 use super::level::Level;
+use crate::encode::seen::Light;
 
 const BRICK_SIDE: usize = 8;
 
-/// The optical depth of the denser rays along an axis. `nuage render` takes the same where it is told nothing.
-const OPTICAL_DEPTH: f32 = 8.0;
+/// The optical depth of the denser columns of cells: about as much as `nuage render` has where it is told nothing.
+const OPTICAL_DEPTH: f32 = 9.5;
 
 /// The part of rays that are less dense than these.
 const DENSER: f32 = 0.9;
@@ -24,8 +25,11 @@ const CELL_SIDES: [usize; 3] = [2, 4, 8];
 /// The most cells of a box. In boxes that need more, all bricks count the same.
 const MAX_CELLS: i64 = 1 << 24;
 
-/// Weights are not less than a half to the power of this.
-const LEAST: f32 = 16.0;
+/// Light is rounded to multiples of this, so that it does not hang on the last digits of exponentials.
+const STEP: f32 = 1.0 / 1024.0;
+
+/// There is at least so much everywhere.
+const LEAST: f32 = 4.0 * STEP;
 
 /// The mean densities of cells of 2³, 4³ or 8³ voxels in a box of bricks, z fastest.
 struct Cells {
@@ -37,27 +41,29 @@ struct Cells {
     first: IVec3,
 }
 
-/// The weight of errors in each brick of a density, a power of a half: frames that differ a little are to have the same
-/// weights.
-pub(super) fn weights(level: &Level) -> Vec<f64> {
-    let Some(cells) = Cells::of(level) else { return vec![1.0; level.bricks.len()] };
+/// The light in each brick of a density, for errors to be multiplied by.
+pub(super) fn light(level: &Level) -> Vec<Light> {
+    let Some(cells) = Cells::of(level) else { return vec![[1.0; 64]; level.bricks.len()] };
     let extinction = OPTICAL_DEPTH / cells.denser_depth();
-    let mut transmittance = vec![0.0; cells.means.len()];
+    let mut light = vec![0.0; cells.means.len()];
     let directions = (0..27).map(|i| [i / 9 - 1, i / 3 % 3 - 1, i % 3 - 1]).filter(|d| *d != [0; 3]);
     for direction in directions {
         let depth = cells.depth(direction);
-        transmittance.iter_mut().zip(&depth).for_each(|(sum, depth)| *sum += (-extinction * depth).exp());
+        // What comes in along one direction goes out along another.
+        light
+            .iter_mut()
+            .zip(&depth)
+            .for_each(|(sum, depth)| *sum += (-2.0 * extinction * depth).exp() / 26.0);
     }
-    let weight = |place: &IVec3| {
-        let cells = cells.of_brick(*place);
-        let (sum, count) = cells.fold((0.0, 0.0), |(sum, count), cell| {
-            let mean: f32 = transmittance[cell] / 26.0;
-            (sum + mean * mean, count + 1.0)
-        });
-        let halvings = if sum > 0.0 { (-(sum / count).log2()).round().clamp(0.0, LEAST) } else { LEAST };
-        0.5_f64.powi(halvings as i32)
+    let rounded = |light: f32| ((light / STEP).round() * STEP).max(LEAST);
+    let in_brick = |place: &IVec3| {
+        let [x, y, z] = cells.first_cell(*place);
+        std::array::from_fn(|block| {
+            let [i, j, k] = [block >> 4, block >> 2 & 3, block & 3].map(|c| c * cells.per_brick / 4);
+            rounded(light[cells.index([x + i, y + j, z + k])])
+        })
     };
-    level.places.iter().map(weight).collect()
+    level.places.iter().map(in_brick).collect()
 }
 
 impl Cells {
@@ -102,12 +108,6 @@ impl Cells {
     /// The first cell of a brick.
     fn first_cell(&self, place: IVec3) -> [usize; 3] {
         (place - self.first).to_array().map(|c| c as usize * self.per_brick)
-    }
-
-    /// The cells of a brick.
-    fn of_brick(&self, place: IVec3) -> impl Iterator<Item = usize> {
-        let ([x, y, z], n) = (self.first_cell(place), self.per_brick);
-        (0..n * n * n).map(move |i| self.index([x + i / n / n, y + i / n % n, z + i % n]))
     }
 
     fn index(&self, [x, y, z]: [usize; 3]) -> usize {
@@ -185,26 +185,33 @@ mod tests {
     }
 
     #[test]
-    fn what_lies_deeper_weighs_less_whatever_the_density() {
+    fn what_lies_deeper_has_less_light_whatever_the_density() {
         let level = ball(6, 1.0);
-        let weights = weights(&level);
-        let at = |place: IVec3| weights[level.places.iter().position(|p| *p == place).unwrap()];
-        let along: Vec<f64> = (0..=6).map(|x| at(IVec3::new(x, 0, 0))).collect();
-        assert!(along.is_sorted(), "{along:?}");
-        assert!(along[0] <= 1.0 / 256.0 && along[6] >= 0.25, "{along:?}");
-        assert_eq!(at(IVec3::new(0, 3, 0)), at(IVec3::new(0, 0, -3)));
+        let lit = light(&level);
+        let at = |place: IVec3| lit[level.places.iter().position(|p| *p == place).unwrap()];
+        // The blocks of a row of bricks from the middle to the outside.
+        let along: Vec<f32> = (0..=6)
+            .flat_map(|x| (0..4).map(move |i| (x, i)))
+            .map(|(x, i)| at(IVec3::new(x, 0, 0))[i << 4])
+            .collect();
+        assert!(along[2..].is_sorted(), "{along:?}");
+        assert!(along[2] <= 0.02 && along[27] >= 0.3, "{along:?}");
+        let mirrored = |x: i32| at(IVec3::new(0, 0, x));
+        assert_eq!(mirrored(3)[2], at(IVec3::new(3, 0, 0))[2 << 4]);
         for density in [1e-30, 1e30] {
-            assert_eq!(super::weights(&ball(6, density)), weights);
+            assert_eq!(light(&ball(6, density)), lit);
         }
     }
 
     #[test]
-    fn tiles_cast_shadows_and_what_is_too_large_weighs_the_same() {
+    fn tiles_cast_shadows_and_what_is_too_large_is_all_lit() {
         let mut level = ball(0, 1.0);
+        let alone = light(&level);
         level.tiles.push((IVec3::splat(1), TileSize::Node4, 1.0));
-        assert_eq!(weights(&level).len(), 1);
+        let shaded = light(&level);
+        assert!(shaded.len() == 1 && shaded[0][63] != alone[0][63]);
         level.tiles.push((IVec3::splat(1 << 20), TileSize::Brick, 1.0));
-        assert_eq!(weights(&level), [1.0]);
-        assert_eq!(weights(&Level::default()), [0.0; 0]);
+        assert_eq!(light(&level), [[1.0; 64]]);
+        assert!(light(&Level::default()).is_empty());
     }
 }

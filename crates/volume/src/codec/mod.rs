@@ -376,11 +376,14 @@ impl BrickContext<'_> {
                         rest
                     }
                 };
-                let bits = u8::try_from(*bits).map_err(|_| DecodeError::Sparse)?;
+                let (bits, is_bent) = sparse::code_bits(*bits).ok_or(DecodeError::Sparse)?;
                 let symbols = sparse::unpack(bits, rest).ok_or(DecodeError::Sparse)?;
                 for (value, symbol) in out.iter_mut().zip(symbols) {
                     *value = match symbol {
                         0 => 0.0,
+                        symbol if is_bent => {
+                            *value + (line.low + line.step * sparse::bend(bits, u32::from(symbol) - 1))
+                        }
                         symbol => *value + line.at(u32::from(symbol) - 1),
                     };
                 }
@@ -475,8 +478,18 @@ mod tests {
                 let expected = if symbol > 0 { predicted + f32::from(symbol - 1) } else { 0.0 };
                 assert_eq!(*value, expected);
             }
-            words[1] = 8;
-            assert_eq!(decode(&words, codec, &mut out), Err(DecodeError::Sparse));
+            // Bent, the codes from 0 to 3 stand at 0, 7/15, 22/15 and 3.
+            words[1] = 2 + sparse::BENT;
+            decode(&words, codec, &mut out).unwrap();
+            for (value, symbol) in out.iter().zip(symbols) {
+                let bent = [0.0, 7.0 / 15.0, 22.0 / 15.0, 3.0];
+                let expected = if symbol > 0 { predicted + bent[usize::from(symbol) - 1] } else { 0.0 };
+                assert!((value - expected).abs() < 1e-6);
+            }
+            for none in [0, 8, 16, 17, u32::MAX] {
+                words[1] = none;
+                assert_eq!(decode(&words, codec, &mut out), Err(DecodeError::Sparse));
+            }
             let short = Codec::Sparse { is_fitted, pairs: 3 };
             words[1] = 2;
             assert_eq!(decode(&words, short, &mut out), Err(DecodeError::Sparse));

@@ -12,6 +12,22 @@ use crate::space::BRICK_VOXELS;
 /// Codes have at most so many bits.
 pub const MAX_BITS: u8 = 7;
 
+/// What is added to the bits of codes, where these are told, if codes are bent.
+pub const BENT: u32 = 8;
+
+/// The bits of codes and whether these are bent, from the word that tells both. `None` if it is none of these.
+pub fn code_bits(word: u32) -> Option<(u8, bool)> {
+    let bits = word & !BENT;
+    (1..=u32::from(MAX_BITS)).contains(&bits).then_some((bits as u8, bits != word))
+}
+
+/// Where on its line a bent code stands: with the first codes closer together than the last. Smoke that is thin is seen as
+/// well as what is dense and hides itself, so it should be told more exactly.
+pub fn bend(bits: u8, code: u32) -> f32 {
+    let (code, last) = (code as f32, ((1_u32 << bits) - 1) as f32);
+    code * (0.2 + 0.8 * code / last)
+}
+
 /// The words of the two masks of blocks.
 const BLOCK_MASK_WORDS: usize = 4;
 

@@ -21,8 +21,8 @@ fn group(codec: Codec, sparse_bits: u32) -> usize {
     match codec {
         Codec::Sparse { is_fitted, .. } => {
             // Any other number is in no file that decodes; such words stand as they are in the last group.
-            let bits = sparse_bits.wrapping_sub(1).min(u32::from(sparse::MAX_BITS) - 1) as usize;
-            FIRST_SPARSE + bits + if is_fitted { usize::from(sparse::MAX_BITS) } else { 0 }
+            let bits = sparse::code_bits(sparse_bits).map_or(sparse::MAX_BITS, |(bits, _)| bits);
+            FIRST_SPARSE + usize::from(bits) - 1 + if is_fitted { usize::from(sparse::MAX_BITS) } else { 0 }
         }
         codec => usize::from(codec.tag()),
     }
