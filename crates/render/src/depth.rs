@@ -316,7 +316,7 @@ fn voxels_of<'v, V: Stored>(values: &'v [V], span: &BrickSpan) -> Result<&'v [V;
 #[inline(always)]
 fn voxel_slabs<S: Simd>(simd: S, ray: &SortedRay, span: &BrickSpan) -> Slabs<S> {
     let first = if ray.is_forward() { 0.0 } else { 7.0 };
-    Slabs::of(simd, &ray.from_corner(span.corner), first, [span.t0, span.t1], LAST_CELL_END)
+    Slabs::of(simd, &ray.seen_from(span.corner), first, [span.t0, span.t1], LAST_CELL_END)
 }
 
 /// A value as [`Bricks`] store it.
@@ -555,7 +555,7 @@ impl<S: Simd> BrickRay<S> {
 #[cfg(test)]
 mod tests {
     use glam::{DAffine3, DVec3, IVec3};
-    use nuage_volume::brick::{BrickSummary, Bricks};
+    use nuage_volume::brick::{BrickSummary, f32_from_finite_f16};
     use nuage_volume::build::{TileSize, TreeBuilder};
     use nuage_volume::channel::{Channel, IndexBox};
     use nuage_volume::space::BRICK_VOXELS;
@@ -640,6 +640,42 @@ mod tests {
             }
         }
         assert!(sum > 10.0 && sum < 390.0, "{sum}");
+    }
+
+    #[test]
+    fn halves_are_widened_in_lanes_as_one_by_one() {
+        for i in (0..0x7c00_u16).step_by(13) {
+            let halves = std::array::from_fn(|lane| i ^ (lane as u16 & 1) << 15);
+            let lanes = dispatch!(level(), simd => u16::widen(simd, halves).to_array());
+            assert_eq!(lanes.map(f32::to_bits), halves.map(|half| f32_from_finite_f16(half).to_bits()));
+        }
+    }
+
+    /// A ray that goes through a lattice of cells falls into the same stretches, whichever axis is its fastest.
+    #[test]
+    fn crossings_are_those_of_the_faces() {
+        for i in 0..300 {
+            let [a, b, c, d, e, f] = [0, 1, 2, 3, 4, 5].map(|j| random(i * 6 + j) * 8.0);
+            let (from, to) = (Vec3::new(a, b, c), Vec3::new(d, e, f));
+            let ray = SortedRay::new(LocalRay::new(from + 16.0, to - from));
+            let span =
+                BrickSpan { t0: 0.0, t1: 1.0, corner: Vec3::splat(16.0), content: SpanContent::TileBorder };
+            let crossings = dispatch!(level(), simd => Crossings::of(simd, &ray, &span));
+            let mut faces = vec![0.0, 1.0];
+            for axis in 0..3 {
+                for face in 1..8 {
+                    let t = (face as f32 - from[axis]) / (to[axis] - from[axis]);
+                    if t > 0.0 && t < 1.0 {
+                        faces.push(t);
+                    }
+                }
+            }
+            faces.sort_by(f32::total_cmp);
+            assert_eq!(crossings.cells + 1, faces.len(), "{ray:?}");
+            for (t, face) in crossings.t.iter().zip(&faces) {
+                assert!((t - face).abs() < 1e-4, "{ray:?}: {t}, not {face}");
+            }
+        }
     }
 
     #[test]

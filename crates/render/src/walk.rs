@@ -331,7 +331,7 @@ impl SortedRay {
 
     /// The same seen from another place.
     #[inline(always)]
-    pub(crate) fn from_corner(&self, corner: Vec3) -> SortedRay {
+    pub(crate) fn seen_from(&self, corner: Vec3) -> SortedRay {
         SortedRay { origin: self.order.sorted((self.local.origin - corner).to_array()), ..*self }
     }
 
