@@ -4,21 +4,26 @@
 //! whose integral has a closed form. [`stepped_transmittance`] takes samples at equal steps, as most programs do, and is here
 //! to be compared with them. Both cost nothing where the field is empty.
 //!
-//! Eight samples of a ray in one brick are taken at once. Light that scatters is followed in [`march`](crate::march) and
+//! Eight samples of a ray are taken at once. Light that scatters is followed in [`march`](crate::march) and
 //! [`path`](crate::path).
 
-use fearless_simd::{Level, Simd, dispatch, f32x8, i32x8, prelude::*};
+use fearless_simd::{Level, Simd, dispatch, f32x4, f32x8, i32x8, prelude::*, u32x8, u64x2};
 use glam::Vec3;
+use nuage_volume::brick::Bricks;
+use nuage_volume::space::BRICK_VOXELS;
 
 use crate::blocks::{Block, Blocks, SIDE};
 use crate::camera::Ray;
 use crate::filter::Filter;
-use crate::simd::level;
+use crate::simd::{each_lane, level};
 use crate::traverse::{Field, LocalRay, Reader};
-use crate::walk::{BrickSpan, Faces, SpanContent, Spans, with_spans};
+use crate::walk::{BrickSpan, Sight, Slabs, SortedRay, SpanContent, Spans, with_spans};
 
-/// The cells of a brick lie at less than this, in voxels from its first corner.
+/// The cells and voxels of a brick lie at less than this, in voxels from its first corner.
 const LAST_CELL_END: f32 = 7.999_999_5;
+
+/// Voxels of the nearest filter begin half a voxel before their place, cells at it.
+pub(crate) const NEAREST_SHIFT: f64 = 0.5;
 
 /// The integral of a field along a ray from its origin on, in values times world lengths. Times the extinction of density 1 it
 /// is the optical depth.
@@ -54,8 +59,8 @@ pub(crate) fn optical_depth_at<'a>(
     dispatch!(level, simd => simd.vectorize(
         #[inline(always)]
         || match filter {
-            Filter::Nearest => optical_depth_on::<_, true>(simd, field, reader, ray),
-            Filter::Trilinear => optical_depth_on::<_, false>(simd, field, reader, ray),
+            Filter::Nearest => nearest_depth_on(simd, field, reader, ray),
+            Filter::Trilinear => trilinear_depth_on(simd, field, reader, ray),
         }
     ))
 }
@@ -72,29 +77,33 @@ pub(crate) fn stepped_transmittance_at<'a>(
     dispatch!(level, simd => simd.vectorize(
         #[inline(always)]
         || match filter {
-            Filter::Nearest => stepped_on::<_, true>(simd, field, reader, ray, step_voxels, extinction),
-            Filter::Trilinear => stepped_on::<_, false>(simd, field, reader, ray, step_voxels, extinction),
+            Filter::Nearest => nearest_steps_on(simd, field, reader, ray, step_voxels, extinction),
+            Filter::Trilinear => trilinear_steps_on(simd, field, reader, ray, step_voxels, extinction),
         }
     ))
 }
 
-/// Where a ray enters and leaves the field, as a filter sees it.
-#[inline(always)]
-pub(crate) fn filter_interval<const NEAREST: bool>(field: &Field<'_>, ray: &Ray) -> Option<[f64; 2]> {
-    field.interval_of(ray, if NEAREST { 0.5 } else { 0.0 })
+/// A ray as samples at whole multiples of a step see it: t = 0 is the first of them in the field.
+struct Steps {
+    ray: SortedRay,
+    length: f32,
+    step: f32,
 }
 
-/// The ray of a filter: voxels of the nearest filter begin half a voxel before their place, cells at it.
-#[inline(always)]
-pub(crate) fn filter_ray<const NEAREST: bool>(ray: LocalRay) -> LocalRay {
-    match NEAREST {
-        true => LocalRay::new(ray.origin + 0.5, ray.direction),
-        false => ray,
+impl Steps {
+    #[inline(always)]
+    fn of(field: &Field<'_>, ray: &Ray, shift_voxels: f64, step_voxels: f32) -> Option<Steps> {
+        let entered = field.enter(ray, shift_voxels)?;
+        let [start, end] = entered.interval;
+        let step = f64::from(step_voxels) / entered.voxels_per_length();
+        let start = (start / step).ceil() * step;
+        let ray = SortedRay::new(entered.local(start));
+        Some(Steps { ray, length: (end - start) as f32, step: step as f32 })
     }
 }
 
 #[inline(always)]
-fn stepped_on<'a, S: Simd, const NEAREST: bool>(
+fn trilinear_steps_on<'a, S: Simd>(
     simd: S,
     field: &Field<'a>,
     reader: &mut Reader<'a>,
@@ -102,20 +111,15 @@ fn stepped_on<'a, S: Simd, const NEAREST: bool>(
     step_voxels: f32,
     extinction: f32,
 ) -> f32 {
-    let Some([start, end]) = filter_interval::<NEAREST>(field, ray) else { return 1.0 };
-    let step = f64::from(step_voxels) / field.voxels_per_length(ray);
-    // t = 0 is the first sample in the field.
-    let start = (start / step).ceil() * step;
-    let local = filter_ray::<NEAREST>(field.local(ray, start));
-    let (length, step) = ((end - start) as f32, step as f32);
+    let Some(steps) = Steps::of(field, ray, 0.0, step_voxels) else { return 1.0 };
     let Reader { walker, blocks, .. } = reader;
-    with_spans!(simd, field, walker, local, length, |spans| {
-        step_spans::<S, NEAREST>(simd, field, blocks, &local, spans, step, extinction)
+    with_spans!(simd, Sight::Cells, field, walker, &steps.ray, steps.length, |spans| {
+        step_cells(simd, field, blocks, &steps.ray.local, spans, steps.step, extinction)
     })
 }
 
 #[inline(always)]
-fn step_spans<'a, S: Simd, const NEAREST: bool>(
+fn step_cells<'a, S: Simd>(
     simd: S,
     field: &Field<'a>,
     blocks: &mut Blocks<'a>,
@@ -126,7 +130,6 @@ fn step_spans<'a, S: Simd, const NEAREST: bool>(
 ) -> f32 {
     let per_step = 1.0 / step;
     let loss = extinction * step;
-    let lanes = f32x8::simd_from(simd, [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0]);
     let (mut passes, mut passes_constant) = (f32x8::splat(simd, 1.0), 1.0);
     while let Some(span) = spans.next_span() {
         let (first, end) = ((span.t0 * per_step).ceil(), (span.t1 * per_step).ceil());
@@ -140,39 +143,91 @@ fn step_spans<'a, S: Simd, const NEAREST: bool>(
         let brick = BrickRay::new(simd, local, &span);
         let mut sample = first;
         while sample < end {
-            let number = lanes + sample;
-            let value = brick.sample::<NEAREST>(block, (number * step).min(span.t1));
+            let number = lanes(simd) + sample;
+            let value = brick.sample(block, (number * step).min(span.t1));
             let value = number.simd_lt(f32x8::splat(simd, end)).select(value, f32x8::splat(simd, 0.0));
             passes *= f32x8::splat(simd, 1.0) - value * loss;
             sample += 8.0;
         }
     }
-    let [a, b, c, d, e, f, g, h] = passes.to_array();
-    passes_constant * (((a * b) * (c * d)) * ((e * f) * (g * h)))
+    passes_constant * product(passes)
 }
 
 #[inline(always)]
-fn optical_depth_on<'a, S: Simd, const NEAREST: bool>(
+fn nearest_steps_on<'a, S: Simd>(
     simd: S,
     field: &Field<'a>,
     reader: &mut Reader<'a>,
     ray: &Ray,
+    step_voxels: f32,
+    extinction: f32,
 ) -> f32 {
-    let Some([start, end]) = filter_interval::<NEAREST>(field, ray) else { return 0.0 };
-    let local = filter_ray::<NEAREST>(field.local(ray, start));
-    let length = (end - start) as f32;
-    let Reader { walker, blocks, .. } = reader;
-    with_spans!(simd, field, walker, local, length, |spans| {
-        integrate_spans::<S, NEAREST>(simd, field, blocks, &local, spans)
+    let Some(steps) = Steps::of(field, ray, NEAREST_SHIFT, step_voxels) else { return 1.0 };
+    let bricks = &field.tree().bricks;
+    with_spans!(simd, Sight::Voxels, field, &mut reader.walker, &steps.ray, steps.length, |spans| {
+        match bricks {
+            Bricks::F32(values) => step_voxels_of(simd, values, &steps, spans, extinction),
+            Bricks::F16(values) => step_voxels_of(simd, values, &steps, spans, extinction),
+        }
     })
 }
 
 #[inline(always)]
-fn integrate_spans<'a, S: Simd, const NEAREST: bool>(
+fn step_voxels_of<S: Simd, V: Stored>(
+    simd: S,
+    values: &[V],
+    steps: &Steps,
+    mut spans: impl Spans,
+    extinction: f32,
+) -> f32 {
+    let (per_step, loss) = (1.0 / steps.step, extinction * steps.step);
+    let [dx, dy, dz] = steps.ray.local.direction.to_array();
+    let (mut passes, mut passes_constant) = (f32x8::splat(simd, 1.0), 1.0);
+    while let Some(span) = spans.next_span() {
+        let (first, end) = ((span.t0 * per_step).ceil(), (span.t1 * per_step).ceil());
+        let brick = match voxels_of(values, &span) {
+            Ok(brick) => brick,
+            Err(value) => {
+                passes_constant *= power(1.0 - loss * value, (end - first) as u32);
+                continue;
+            }
+        };
+        let [x, y, z] = (steps.ray.local.origin - span.corner).to_array();
+        let mut sample = first;
+        while sample < end {
+            let number = lanes(simd) + sample;
+            let t = number * steps.step;
+            // Below the brick by rounding, the conversion to a whole number brings it back.
+            let i = (t * dx + x).min(LAST_CELL_END).to_int::<i32x8<S>>();
+            let j = (t * dy + y).min(LAST_CELL_END).to_int::<i32x8<S>>();
+            let k = (t * dz + z).min(LAST_CELL_END).to_int::<i32x8<S>>();
+            let at = ((i << 6) + (j << 3) + k).to_array();
+            let value = V::widen(simd, each_lane!(|lane| brick[at[lane] as usize % BRICK_VOXELS]));
+            let value = number.simd_lt(end).select(value, f32x8::splat(simd, 0.0));
+            passes *= f32x8::splat(simd, 1.0) - value * loss;
+            sample += 8.0;
+        }
+    }
+    passes_constant * product(passes)
+}
+
+#[inline(always)]
+fn trilinear_depth_on<'a, S: Simd>(simd: S, field: &Field<'a>, reader: &mut Reader<'a>, ray: &Ray) -> f32 {
+    let Some(entered) = field.enter(ray, 0.0) else { return 0.0 };
+    let [start, end] = entered.interval;
+    let sorted = SortedRay::new(entered.local(start));
+    let Reader { walker, blocks, .. } = reader;
+    with_spans!(simd, Sight::Cells, field, walker, &sorted, (end - start) as f32, |spans| {
+        integrate_cells(simd, field, blocks, &sorted, spans)
+    })
+}
+
+#[inline(always)]
+fn integrate_cells<'a, S: Simd>(
     simd: S,
     field: &Field<'a>,
     blocks: &mut Blocks<'a>,
-    local: &LocalRay,
+    ray: &SortedRay,
     mut spans: impl Spans,
 ) -> f32 {
     let (mut depth, mut depth_constant) = (f32x8::splat(simd, 0.0), 0.0);
@@ -184,21 +239,127 @@ fn integrate_spans<'a, S: Simd, const NEAREST: bool>(
                 continue;
             }
         };
-        let brick = BrickRay::new(simd, local, &span);
-        let crossings = Crossings::of(simd, local, &span);
+        let brick = BrickRay::new(simd, &ray.local, &span);
+        let crossings = Crossings::of(simd, ray, &span);
         let mut cell = 0;
         while cell < crossings.cells {
             let t0 = f32x8::from_slice(simd, &crossings.t[cell..cell + 8]);
             let t1 = f32x8::from_slice(simd, &crossings.t[cell + 1..cell + 9]);
-            depth += match NEAREST {
-                true => brick.sample::<true>(block, (t0 + t1) * 0.5) * (t1 - t0),
-                false => brick.integral(block, t0, t1),
-            };
+            depth += brick.integral(block, t0, t1);
             cell += 8;
         }
     }
-    let [a, b, c, d, e, f, g, h] = depth.to_array();
-    depth_constant + (((a + b) + (c + d)) + ((e + f) + (g + h)))
+    depth_constant + sum(depth)
+}
+
+#[inline(always)]
+fn nearest_depth_on<'a, S: Simd>(simd: S, field: &Field<'a>, reader: &mut Reader<'a>, ray: &Ray) -> f32 {
+    let Some(entered) = field.enter(ray, NEAREST_SHIFT) else { return 0.0 };
+    let [start, end] = entered.interval;
+    let sorted = SortedRay::new(entered.local(start));
+    let (walker, bricks) = (&mut reader.walker, &field.tree().bricks);
+    with_spans!(simd, Sight::Voxels, field, walker, &sorted, (end - start) as f32, |spans| {
+        match bricks {
+            Bricks::F32(values) => integrate_voxels(simd, values, &sorted, spans),
+            Bricks::F16(values) => integrate_voxels(simd, values, &sorted, spans),
+        }
+    })
+}
+
+#[inline(always)]
+fn integrate_voxels<S: Simd, V: Stored>(
+    simd: S,
+    values: &[V],
+    ray: &SortedRay,
+    mut spans: impl Spans,
+) -> f32 {
+    let shifts = ray.order().sorted([6, 3, 0]);
+    let (mut depth, mut depth_constant) = (f32x8::splat(simd, 0.0), 0.0);
+    while let Some(span) = spans.next_span() {
+        let brick = match voxels_of(values, &span) {
+            Ok(brick) => brick,
+            Err(value) => {
+                depth_constant += value * (span.t1 - span.t0);
+                continue;
+            }
+        };
+        let slabs = voxel_slabs(simd, ray, &span);
+        let along = slabs.number << shifts[0];
+        // Counted, since iterators over vectors are not always inlined.
+        for i in 0..3 {
+            let [u, v] = slabs.across[i];
+            let length = slabs.t[i + 1] - slabs.t[i];
+            // Few slabs have two crossings, some have none.
+            if length.simd_gt(0.0).any_true() {
+                let at = (along + (u << shifts[1]) + (v << shifts[2])).to_array();
+                depth += V::widen(simd, each_lane!(|lane| brick[at[lane] as usize % BRICK_VOXELS])) * length;
+            }
+        }
+    }
+    depth_constant + sum(depth)
+}
+
+/// The voxels of the brick of a span, or the one value that they have.
+#[inline(always)]
+fn voxels_of<'v, V: Stored>(values: &'v [V], span: &BrickSpan) -> Result<&'v [V; BRICK_VOXELS], f32> {
+    match span.content {
+        SpanContent::Brick(number) => {
+            let values = values.get(number as usize * BRICK_VOXELS..);
+            values.and_then(|values| values.first_chunk()).ok_or(0.0)
+        }
+        SpanContent::Constant(value) => Err(value),
+        SpanContent::TileBorder => Err(0.0),
+    }
+}
+
+/// The layers of voxels of a span's brick.
+#[inline(always)]
+fn voxel_slabs<S: Simd>(simd: S, ray: &SortedRay, span: &BrickSpan) -> Slabs<S> {
+    let first = if ray.is_forward() { 0.0 } else { 7.0 };
+    Slabs::of(simd, &ray.seen_from(span.corner), first, [span.t0, span.t1], LAST_CELL_END)
+}
+
+/// A value as [`Bricks`] store it.
+trait Stored: Copy + Default {
+    /// The numbers that eight of them stand for.
+    fn widen<S: Simd>(simd: S, values: [Self; 8]) -> f32x8<S>;
+}
+
+impl Stored for f32 {
+    #[inline(always)]
+    fn widen<S: Simd>(simd: S, values: [f32; 8]) -> f32x8<S> {
+        f32x8::simd_from(simd, values)
+    }
+}
+
+impl Stored for u16 {
+    /// What `f32_from_finite_f16` does, in lanes.
+    #[inline(always)]
+    fn widen<S: Simd>(simd: S, values: [u16; 8]) -> f32x8<S> {
+        const TWO_POW_112: f32 = f32::from_bits((127 + 112) << 23);
+        let bits = u32x8::simd_from(simd, each_lane!(|lane| u32::from(values[lane])));
+        let magnitude = ((bits & 0x7fff) << 13).bitcast::<f32x8<S>>() * TWO_POW_112;
+        (magnitude.bitcast::<u32x8<S>>() | ((bits & 0x8000) << 16)).bitcast()
+    }
+}
+
+#[inline(always)]
+fn lanes<S: Simd>(simd: S) -> f32x8<S> {
+    f32x8::simd_from(simd, [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0])
+}
+
+/// The sum of all lanes, in the same order everywhere.
+#[inline(always)]
+fn sum<S: Simd>(lanes: f32x8<S>) -> f32 {
+    let [a, b, c, d, e, f, g, h] = lanes.to_array();
+    ((a + b) + (c + d)) + ((e + f) + (g + h))
+}
+
+/// The product of all lanes, in the same order everywhere.
+#[inline(always)]
+fn product<S: Simd>(lanes: f32x8<S>) -> f32 {
+    let [a, b, c, d, e, f, g, h] = lanes.to_array();
+    ((a * b) * (c * d)) * ((e * f) * (g * h))
 }
 
 /// The values of the brick of a span, or the one value that it has.
@@ -209,7 +370,7 @@ pub(crate) fn block_of<'b, 'a>(
     span: &BrickSpan,
 ) -> Result<&'b Block, f32> {
     match span.content {
-        SpanContent::Entry(entry) => Ok(blocks.of_entry(entry as usize, || field.brick_at(span.corner))),
+        SpanContent::Brick(entry) => Ok(blocks.of_entry(entry as usize, || field.brick_at(span.corner))),
         SpanContent::Constant(value) => Err(value),
         SpanContent::TileBorder => Ok(blocks.of_tile(field.brick_at(span.corner))),
     }
@@ -237,39 +398,27 @@ pub(crate) struct Crossings {
 }
 
 impl Crossings {
-    /// More than the 24 faces of voxels that a ray can cross in a brick, rounding included.
-    const MOST: usize = 32;
+    /// Three stretches in each of eight layers.
+    const MOST: usize = 24;
 
     #[inline(always)]
-    pub(crate) fn of<S: Simd>(simd: S, ray: &LocalRay, span: &BrickSpan) -> Crossings {
-        let origin = ray.origin - span.corner;
-        let entry = origin + ray.direction * span.t0;
-        let next = |entry: f32, origin: f32, direction: f32, inverse: f32| {
-            // Truncation: an entry is not below 0 but for rounding.
-            let cell = (entry as i32).clamp(0, 7);
-            let face = cell + i32::from(direction >= 0.0);
-            match direction == 0.0 {
-                true => f32::INFINITY,
-                false => (face as f32 - origin) * inverse,
-            }
-        };
-        let (inverse, step) = (ray.inverse(), ray.inverse().abs());
-        let x = next(entry.x, origin.x, ray.direction.x, inverse.x);
-        let y = next(entry.y, origin.y, ray.direction.y, inverse.y);
-        let z = next(entry.z, origin.z, ray.direction.z, inverse.z);
-        let mut faces = Faces::new(simd, [x, y, z], step);
+    pub(crate) fn of<S: Simd>(simd: S, ray: &SortedRay, span: &BrickSpan) -> Crossings {
+        let slabs = voxel_slabs(simd, ray, span);
+        let mut starts = [0.0; 32];
+        for i in 0..4 {
+            slabs.t[i].store_slice(&mut starts[8 * i..8 * i + 8]);
+        }
         let mut t = [span.t1; Crossings::MOST + 8];
-        t[0] = span.t0;
-        let mut cells = 1;
-        while cells < Crossings::MOST {
-            let nearest = faces.pass().0;
-            if nearest >= span.t1 {
-                break;
-            }
-            t[cells] = if nearest > span.t0 { nearest } else { span.t0 };
+        let mut left = slabs.stretches();
+        let mut cells = 0;
+        while left != 0 && cells < Crossings::MOST {
+            let number = left.trailing_zeros();
+            t[cells] = starts[((number & 3) * 8 + (number >> 2)) as usize % 32];
+            left &= left - 1;
             cells += 1;
         }
-        Crossings { t, cells }
+        t[0] = span.t0;
+        Crossings { t, cells: cells.max(1) }
     }
 }
 
@@ -309,6 +458,12 @@ pub(crate) fn interpolate(block: &Block, position: Vec3) -> f32 {
     mix(low, high, x)
 }
 
+/// Between two numbers.
+#[inline(always)]
+fn mix<S: Simd>(a: f32x8<S>, b: f32x8<S>, t: f32x8<S>) -> f32x8<S> {
+    a + (b - a) * t
+}
+
 /// A ray in voxels from the first corner of a brick, in each lane.
 pub(crate) struct BrickRay<S: Simd> {
     simd: S,
@@ -323,33 +478,24 @@ impl<S: Simd> BrickRay<S> {
     }
 
     /// The cells and the fractions inside them. Rounding may put a point a little outside of the brick: below it, the
-    /// conversion to a whole number brings it back; above it, there is a voxel, but no cell.
+    /// conversion to a whole number brings it back.
     #[inline(always)]
-    fn cells<const NEAREST: bool>(&self, t: f32x8<S>) -> ([i32; 8], [f32x8<S>; 3]) {
-        let axis = |origin: f32, direction: f32| {
-            let p = t * direction + origin;
-            let p = if NEAREST { p } else { p.min(LAST_CELL_END) };
-            let cell = p.to_int::<i32x8<S>>();
-            (cell, p - cell.to_float::<f32x8<S>>())
-        };
-        let (x, fx) = axis(self.origin.x, self.direction.x);
-        let (y, fy) = axis(self.origin.y, self.direction.y);
-        let (z, fz) = axis(self.origin.z, self.direction.z);
-        let times_nine = |i: i32x8<S>| (i << 3) + i;
-        ((times_nine(times_nine(x) + y) + z).to_array(), [fx, fy, fz])
+    fn cells(&self, t: f32x8<S>) -> ([i32; 8], [f32x8<S>; 3]) {
+        let x = (t * self.direction.x + self.origin.x).min(LAST_CELL_END);
+        let y = (t * self.direction.y + self.origin.y).min(LAST_CELL_END);
+        let z = (t * self.direction.z + self.origin.z).min(LAST_CELL_END);
+        let (i, j, k) = (x.to_int::<i32x8<S>>(), y.to_int::<i32x8<S>>(), z.to_int::<i32x8<S>>());
+        let row = (i << 3) + i + j;
+        let fractions =
+            [x - i.to_float::<f32x8<S>>(), y - j.to_float::<f32x8<S>>(), z - k.to_float::<f32x8<S>>()];
+        (((row << 3) + row + k).to_array(), fractions)
     }
 
     /// The values at `t`.
     #[inline(always)]
-    pub(crate) fn sample<const NEAREST: bool>(&self, block: &Block, t: f32x8<S>) -> f32x8<S> {
-        let (offsets, [x, y, z]) = self.cells::<NEAREST>(t);
-        if NEAREST {
-            return f32x8::from_fn(self.simd, |lane| {
-                block.get(offsets[lane] as usize).copied().unwrap_or(0.0)
-            });
-        }
+    pub(crate) fn sample(&self, block: &Block, t: f32x8<S>) -> f32x8<S> {
+        let (offsets, [x, y, z]) = self.cells(t);
         let c = self.corners(block, offsets);
-        let mix = |a: f32x8<S>, b: f32x8<S>, t: f32x8<S>| a + (b - a) * t;
         let low = mix(mix(c[0], c[1], z), mix(c[2], c[3], z), y);
         let high = mix(mix(c[4], c[5], z), mix(c[6], c[7], z), y);
         mix(low, high, x)
@@ -358,10 +504,27 @@ impl<S: Simd> BrickRay<S> {
     /// The eight corners of the cell in each lane, corner `i` at `dx << 2 | dy << 1 | dz`.
     #[inline(always)]
     fn corners(&self, block: &Block, offsets: [i32; 8]) -> [f32x8<S>; 8] {
-        let cells: [&[f32; CORNERS_SPAN]; 8] =
-            std::array::from_fn(|lane| corners_from(block, offsets[lane] as usize));
-        let corner = |at: usize| f32x8::from_fn(self.simd, |lane| cells[lane][at]);
-        [corner(0), corner(1), corner(9), corner(10), corner(81), corner(82), corner(90), corner(91)]
+        let cells = each_lane!(|lane| corners_from(block, offsets[lane] as usize));
+        let [c0, c1] = self.pairs(cells, 0);
+        let [c2, c3] = self.pairs(cells, SIDE);
+        let [c4, c5] = self.pairs(cells, SIDE * SIDE);
+        let [c6, c7] = self.pairs(cells, SIDE * SIDE + SIDE);
+        [c0, c1, c2, c3, c4, c5, c6, c7]
+    }
+
+    /// The values at an offset and behind it. Neighbours are read in one piece of 64 bits.
+    #[inline(always)]
+    fn pairs(&self, cells: [&[f32; CORNERS_SPAN]; 8], at: usize) -> [f32x8<S>; 2] {
+        let pairs = each_lane!(|lane| {
+            let v = cells[lane];
+            u64::from(v[at].to_bits()) | u64::from(v[at + 1].to_bits()) << 32
+        });
+        let [a, b, c, d, e, f, g, h] = pairs;
+        let ab = u64x2::simd_from(self.simd, [a, b]).bitcast::<f32x4<S>>();
+        let cd = u64x2::simd_from(self.simd, [c, d]).bitcast::<f32x4<S>>();
+        let ef = u64x2::simd_from(self.simd, [e, f]).bitcast::<f32x4<S>>();
+        let gh = u64x2::simd_from(self.simd, [g, h]).bitcast::<f32x4<S>>();
+        [ab.unzip_low(cd).combine(ef.unzip_low(gh)), ab.unzip_high(cd).combine(ef.unzip_high(gh))]
     }
 
     /// The integrals of the interpolation over stretches inside one cell each.
@@ -371,11 +534,10 @@ impl<S: Simd> BrickRay<S> {
     /// `xyz` over a line through `m` is `mx my mz + (mx dy dz + my dx dz + mz dx dy) / 12`, and likewise for `xy`.
     #[inline(always)]
     fn integral(&self, block: &Block, t0: f32x8<S>, t1: f32x8<S>) -> f32x8<S> {
-        let (offsets, [x, y, z]) = self.cells::<false>((t0 + t1) * 0.5);
+        let (offsets, [x, y, z]) = self.cells((t0 + t1) * 0.5);
         let c = self.corners(block, offsets);
         let length = t1 - t0;
-        let [dx, dy, dz] = self.direction.to_array().map(|direction| length * direction);
-        let mix = |a: f32x8<S>, b: f32x8<S>, t: f32x8<S>| a + (b - a) * t;
+        let (dx, dy, dz) = (length * self.direction.x, length * self.direction.y, length * self.direction.z);
         // Along z: values and slopes of the four edges; then along y, then along x.
         let (e0, e1, e2, e3) = (c[1] - c[0], c[3] - c[2], c[5] - c[4], c[7] - c[6]);
         let (v0, v1, v2, v3) = (c[0] + e0 * z, c[2] + e1 * z, c[4] + e2 * z, c[6] + e3 * z);
@@ -393,7 +555,7 @@ impl<S: Simd> BrickRay<S> {
 #[cfg(test)]
 mod tests {
     use glam::{DAffine3, DVec3, IVec3};
-    use nuage_volume::brick::{BrickSummary, Bricks};
+    use nuage_volume::brick::{BrickSummary, f32_from_finite_f16};
     use nuage_volume::build::{TileSize, TreeBuilder};
     use nuage_volume::channel::{Channel, IndexBox};
     use nuage_volume::space::BRICK_VOXELS;
@@ -462,7 +624,7 @@ mod tests {
         let field = Field::new(&channel).unwrap();
         let by_tree = Field::new(&channel).unwrap().without_map();
         let (mut reader, mut tree_reader) = (field.reader(), by_tree.reader());
-        assert!(field.map().is_some() && by_tree.map().is_none());
+        assert!(field.map(Sight::Cells).is_some() && by_tree.map(Sight::Cells).is_none());
         let mut sum = 0.0;
         for ray in rays() {
             for filter in [Filter::Nearest, Filter::Trilinear] {
@@ -481,6 +643,42 @@ mod tests {
     }
 
     #[test]
+    fn halves_are_widened_in_lanes_as_one_by_one() {
+        for i in (0..0x7c00_u16).step_by(13) {
+            let halves = std::array::from_fn(|lane| i ^ (lane as u16 & 1) << 15);
+            let lanes = dispatch!(level(), simd => u16::widen(simd, halves).to_array());
+            assert_eq!(lanes.map(f32::to_bits), halves.map(|half| f32_from_finite_f16(half).to_bits()));
+        }
+    }
+
+    /// A ray that goes through a lattice of cells falls into the same stretches, whichever axis is its fastest.
+    #[test]
+    fn crossings_are_those_of_the_faces() {
+        for i in 0..300 {
+            let [a, b, c, d, e, f] = [0, 1, 2, 3, 4, 5].map(|j| random(i * 6 + j) * 8.0);
+            let (from, to) = (Vec3::new(a, b, c), Vec3::new(d, e, f));
+            let ray = SortedRay::new(LocalRay::new(from + 16.0, to - from));
+            let span =
+                BrickSpan { t0: 0.0, t1: 1.0, corner: Vec3::splat(16.0), content: SpanContent::TileBorder };
+            let crossings = dispatch!(level(), simd => Crossings::of(simd, &ray, &span));
+            let mut faces = vec![0.0, 1.0];
+            for axis in 0..3 {
+                for face in 1..8 {
+                    let t = (face as f32 - from[axis]) / (to[axis] - from[axis]);
+                    if t > 0.0 && t < 1.0 {
+                        faces.push(t);
+                    }
+                }
+            }
+            faces.sort_by(f32::total_cmp);
+            assert_eq!(crossings.cells + 1, faces.len(), "{ray:?}");
+            for (t, face) in crossings.t.iter().zip(&faces) {
+                assert!((t - face).abs() < 1e-4, "{ray:?}: {t}, not {face}");
+            }
+        }
+    }
+
+    #[test]
     fn lanes_do_what_the_scalar_code_does() {
         let block: Block = std::array::from_fn(|i| random(i as u32));
         for i in 0..500 {
@@ -491,7 +689,7 @@ mod tests {
             let span = BrickSpan { t0: 0.0, t1: 1.0, corner: Vec3::ZERO, content };
             let lanes = dispatch!(level(), simd => simd.vectorize(
                 #[inline(always)]
-                || BrickRay::new(simd, &ray, &span).sample::<false>(&block, f32x8::splat(simd, 0.0)).to_array()
+                || BrickRay::new(simd, &ray, &span).sample(&block, f32x8::splat(simd, 0.0)).to_array()
             ));
             assert_eq!(lanes, [interpolate(&block, at); 8]);
         }

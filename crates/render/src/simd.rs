@@ -13,3 +13,17 @@ static LEVEL: LazyLock<Level> = LazyLock::new(Level::new);
 pub(crate) fn level() -> Level {
     *LEVEL
 }
+
+/// An array of what an expression gives for each of eight lanes.
+///
+/// A macro: functions such as `array::map` are not always inlined where the vector instructions are known, and a call for each
+/// lane costs more than what it does.
+macro_rules! each_lane {
+    (|$lane:ident| $value:expr) => {
+        each_lane!(@ $lane, $value, 0 1 2 3 4 5 6 7)
+    };
+    (@ $lane:ident, $value:expr, $($number:literal)*) => {
+        [$({ let $lane: usize = $number; $value }),*]
+    };
+}
+pub(crate) use each_lane;

@@ -5,13 +5,14 @@
 
 use fearless_simd::{Simd, dispatch, f32x8, prelude::*};
 use glam::{IVec3, Vec3};
+use nuage_volume::brick::Bricks;
 
 use crate::blocks::{Block, Blocks};
 use crate::camera::Ray;
-use crate::depth::{BrickRay, Crossings, block_of, corners_at, filter_interval, filter_ray};
+use crate::depth::{BrickRay, Crossings, NEAREST_SHIFT, block_of, corners_at};
 use crate::simd::level;
 use crate::traverse::{Field, LocalRay, Reader};
-use crate::walk::{BrickSpan, SpanContent, Spans, with_spans};
+use crate::walk::{BrickSpan, Sight, SortedRay, SpanContent, Spans, with_spans};
 
 /// Where a ray meets a surface.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -45,17 +46,21 @@ pub fn first_hit<'a>(
     ray: &Ray,
     surface: f32,
 ) -> Option<SurfaceHit> {
-    let [start, end] = field.interval(ray)?;
-    let local = field.local(ray, start);
-    let length = (end - start) as f32;
     let Reader { walker, blocks, .. } = reader;
-    let t = dispatch!(level(), simd => simd.vectorize(
+    let (start, t, position) = dispatch!(level(), simd => simd.vectorize(
         #[inline(always)]
-        || with_spans!(simd, field, walker, local, length, |spans| {
-            meet_surface(simd, field, blocks, &local, spans, surface)
-        })
+        || {
+            let entered = field.enter(ray, 0.0)?;
+            let [start, end] = entered.interval;
+            let sorted = SortedRay::new(entered.local(start));
+            let length = (end - start) as f32;
+            let t = with_spans!(simd, Sight::Cells, field, walker, &sorted, length, |spans| {
+                meet_surface(simd, field, blocks, &sorted, spans, surface)
+            })?;
+            Some((start, t, sorted.local.at(t)))
+        }
     ))?;
-    let slope = slope(field, blocks, local.at(t));
+    let slope = slope(field, blocks, position);
     // A normal turns with the transposed inverse of what turns points.
     let normal = (field.directions().transpose() * -slope).try_normalize();
     let normal = normal.unwrap_or(-ray.direction.as_vec3());
@@ -69,17 +74,21 @@ pub fn first_voxel<'a>(
     ray: &Ray,
     above: f32,
 ) -> Option<VoxelHit> {
-    let [start, end] = filter_interval::<true>(field, ray)?;
-    let local = filter_ray::<true>(field.local(ray, start));
-    let length = (end - start) as f32;
-    let Reader { walker, blocks, .. } = reader;
-    let (t, place, value) = dispatch!(level(), simd => simd.vectorize(
+    dispatch!(level(), simd => simd.vectorize(
         #[inline(always)]
-        || with_spans!(simd, field, walker, local, length, |spans| {
-            meet_voxel(simd, field, blocks, &local, spans, above)
-        })
-    ))?;
-    Some(VoxelHit { distance: start + f64::from(t), voxel: field.voxel_at(place), value })
+        || {
+            let entered = field.enter(ray, NEAREST_SHIFT)?;
+            let [start, end] = entered.interval;
+            let sorted = SortedRay::new(entered.local(start));
+            let length = (end - start) as f32;
+            let bricks = &field.tree().bricks;
+            let (t, place, value) =
+                with_spans!(simd, Sight::Voxels, field, &mut reader.walker, &sorted, length, |spans| {
+                    meet_voxel(simd, bricks, &sorted, spans, above)
+                })?;
+            Some(VoxelHit { distance: start + f64::from(t), voxel: field.voxel_at(place), value })
+        }
+    ))
 }
 
 /// Halvings and chords until a root is as good as single precision makes it.
@@ -90,26 +99,26 @@ fn meet_surface<'a, S: Simd>(
     simd: S,
     field: &Field<'a>,
     blocks: &mut Blocks<'a>,
-    local: &LocalRay,
+    ray: &SortedRay,
     mut spans: impl Spans,
     surface: f32,
 ) -> Option<f32> {
     while let Some(span) = spans.next_span() {
         match span.content {
-            SpanContent::Entry(entry) if field.bounds(entry).max < surface => continue,
+            SpanContent::Brick(entry) if field.bounds(entry).max < surface => continue,
             SpanContent::Constant(value) if value < surface => continue,
             SpanContent::Constant(_) => return Some(span.t0),
             _ => {}
         }
         let Ok(block) = block_of(field, blocks, &span) else { continue };
-        let crossings = Crossings::of(simd, local, &span);
+        let crossings = Crossings::of(simd, ray, &span);
+        let local = &ray.local;
         let brick = BrickRay::new(simd, local, &span);
         let mut cell = 0;
         while cell < crossings.cells {
             // Where cells end, the value is that of the next one too.
             let ends = f32x8::from_slice(simd, &crossings.t[cell + 1..cell + 9]);
-            let reached =
-                brick.sample::<false>(block, ends).simd_ge(f32x8::splat(simd, surface)).to_bitmask();
+            let reached = brick.sample(block, ends).simd_ge(f32x8::splat(simd, surface)).to_bitmask();
             let first = cell + reached.trailing_zeros() as usize;
             if reached != 0 && first < crossings.cells {
                 let ends = [crossings.t[first], crossings.t[first + 1]];
@@ -175,30 +184,28 @@ fn slope<'a>(field: &Field<'a>, blocks: &mut Blocks<'a>, position: Vec3) -> Vec3
 }
 
 #[inline(always)]
-fn meet_voxel<'a, S: Simd>(
+fn meet_voxel<S: Simd>(
     simd: S,
-    field: &Field<'a>,
-    blocks: &mut Blocks<'a>,
-    local: &LocalRay,
+    bricks: &Bricks,
+    ray: &SortedRay,
     mut spans: impl Spans,
     above: f32,
 ) -> Option<(f32, Vec3, f32)> {
     while let Some(span) = spans.next_span() {
-        let voxel_at = |t: f32| {
-            let local = (local.at(t) - span.corner).clamp(Vec3::ZERO, Vec3::splat(7.0)).floor();
-            (local, span.corner + local)
+        let number = match span.content {
+            SpanContent::Brick(number) => number,
+            SpanContent::Constant(value) if value > above => {
+                return Some((span.t0, in_span(&ray.local, &span), value));
+            }
+            _ => continue,
         };
-        let block = match block_of(field, blocks, &span) {
-            Ok(block) => block,
-            Err(value) if value > above => return Some((span.t0, in_span(local, &span), value)),
-            Err(_) => continue,
-        };
-        let crossings = Crossings::of(simd, local, &span);
+        let crossings = Crossings::of(simd, ray, &span);
         for cell in crossings.t[..=crossings.cells].windows(2) {
-            let (cell_local, place) = voxel_at(0.5 * (cell[0] + cell[1]));
-            let value = corners_at(block, cell_local)[0];
+            let middle = ray.local.at(0.5 * (cell[0] + cell[1])) - span.corner;
+            let voxel = middle.clamp(Vec3::ZERO, Vec3::splat(7.0)).as_ivec3();
+            let value = bricks.value(number, (voxel.x << 6 | voxel.y << 3 | voxel.z) as usize);
             if value > above {
-                return Some((cell[0], place, value));
+                return Some((cell[0], span.corner + voxel.as_vec3(), value));
             }
         }
     }

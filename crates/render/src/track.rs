@@ -12,7 +12,7 @@ use crate::depth::{block_of, interpolate};
 use crate::math::ln;
 use crate::simd::level;
 use crate::traverse::{Field, LocalRay, Reader};
-use crate::walk::{SpanContent, Spans, with_spans};
+use crate::walk::{Sight, SortedRay, SpanContent, Spans, with_spans};
 
 /// The distance at which a ray collides with a medium of `extinction` at value 1, per world length; `None` if it passes. Over
 /// many rays the share that passes is `exp(-extinction × optical depth)`, with trilinear interpolation.
@@ -25,17 +25,20 @@ pub fn first_collision<'a>(
     extinction: f32,
     mut random: impl FnMut() -> f32,
 ) -> Option<f64> {
-    let [start, end] = field.interval(ray)?;
-    let local = field.local(ray, start);
-    let length = (end - start) as f32;
-    let Reader { walker, blocks, .. } = reader;
-    let t = dispatch!(level(), simd => simd.vectorize(
+    dispatch!(level(), simd => simd.vectorize(
         #[inline(always)]
-        || with_spans!(simd, field, walker, local, length, |spans| {
-            collide(field, blocks, &local, spans, extinction, &mut random)
-        })
-    ))?;
-    Some(start + f64::from(t))
+        || {
+            let entered = field.enter(ray, 0.0)?;
+            let [start, end] = entered.interval;
+            let sorted = SortedRay::new(entered.local(start));
+            let length = (end - start) as f32;
+            let Reader { walker, blocks, .. } = reader;
+            let t = with_spans!(simd, Sight::Cells, field, walker, &sorted, length, |spans| {
+                collide(field, blocks, &sorted.local, spans, extinction, &mut random)
+            })?;
+            Some(start + f64::from(t))
+        }
+    ))
 }
 
 #[inline(always)]
@@ -52,7 +55,7 @@ fn collide<'a>(
     while let Some(span) = spans.next_span() {
         let max = match span.content {
             SpanContent::Constant(value) => value,
-            SpanContent::Entry(entry) => field.bounds(entry).max,
+            SpanContent::Brick(entry) => field.bounds(entry).max,
             SpanContent::TileBorder => field.tile_bounds(span.corner).max,
         };
         let majorant = max * extinction;

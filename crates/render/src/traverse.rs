@@ -18,7 +18,7 @@ use nuage_volume::tree::{Content, Tree};
 
 use crate::blocks::{BlockStore, Blocks};
 use crate::camera::Ray;
-use crate::walk::{BrickMap, BrickSpan, SpanContent};
+use crate::walk::{BrickMap, BrickSpan, Sight, SpanContent, voxels_of};
 
 /// A channel made ready for rays: its transform inverted, its extent in the coordinates of the walk.
 ///
@@ -28,8 +28,8 @@ use crate::walk::{BrickMap, BrickSpan, SpanContent};
 pub struct Field<'a> {
     channel: &'a Channel,
     blocks: BlockStore,
-    /// Made when the first ray asks for it.
-    map: OnceLock<Option<BrickMap>>,
+    /// By what is looked for, made when the first ray asks for it.
+    maps: [OnceLock<Option<BrickMap>>; 2],
     index_from_world: DMat3,
     /// World origin in positions of the walk.
     offset: DVec3,
@@ -59,6 +59,14 @@ pub struct LocalRay {
     /// Voxels per unit of t, which is world length.
     pub direction: Vec3,
     inverse: Vec3,
+}
+
+/// A ray where it is in a [`Field`], in double precision.
+pub(crate) struct Entered {
+    origin: DVec3,
+    direction: DVec3,
+    /// Where it enters and leaves, as distances from its origin.
+    pub(crate) interval: [f64; 2],
 }
 
 /// A stretch of a ray.
@@ -111,7 +119,7 @@ impl<'a> Field<'a> {
         Some(Field {
             channel,
             blocks: BlockStore::new(&channel.tree),
-            map: OnceLock::new(),
+            maps: [OnceLock::new(), OnceLock::new()],
             index_from_world: inverse.matrix3,
             offset: inverse.translation - base,
             base_brick,
@@ -122,9 +130,10 @@ impl<'a> Field<'a> {
 
     /// A flat map of the field's bricks, unless they are too many.
     #[inline]
-    pub(crate) fn map(&self) -> Option<&BrickMap> {
+    pub(crate) fn map(&self, sight: Sight) -> Option<&BrickMap> {
         let [first, last] = self.brick_box;
-        self.map.get_or_init(|| BrickMap::new(&mut Accessor::new(&self.channel.tree), first, last)).as_ref()
+        let make = || BrickMap::new(&mut Accessor::new(&self.channel.tree), sight, first, last);
+        self.maps[sight as usize].get_or_init(make).as_ref()
     }
 
     /// The brick whose first voxel is at a position of the walk.
@@ -135,7 +144,7 @@ impl<'a> Field<'a> {
     /// The same field, to be walked by its tree.
     #[cfg(test)]
     pub(crate) fn without_map(self) -> Self {
-        Field { map: OnceLock::from(None), ..self }
+        Field { maps: [OnceLock::from(None), OnceLock::from(None)], ..self }
     }
 
     /// The tree of the channel.
@@ -175,12 +184,12 @@ impl<'a> Field<'a> {
 
     /// Where a ray enters and leaves the field, as distances from its origin.
     pub fn interval(&self, ray: &Ray) -> Option<[f64; 2]> {
-        self.interval_of(ray, 0.0)
+        self.enter(ray, 0.0).map(|entered| entered.interval)
     }
 
-    /// The same for a ray that is moved by as many voxels along each axis.
-    #[inline]
-    pub(crate) fn interval_of(&self, ray: &Ray, shift_voxels: f64) -> Option<[f64; 2]> {
+    /// A ray, moved by as many voxels along each axis, where it is in the field.
+    #[inline(always)]
+    pub(crate) fn enter(&self, ray: &Ray, shift_voxels: f64) -> Option<Entered> {
         let origin = self.index_from_world * ray.origin + self.offset + shift_voxels;
         let direction = self.index_from_world * ray.direction;
         let inverse = direction.recip();
@@ -197,18 +206,13 @@ impl<'a> Field<'a> {
             t0 = if near[axis] > t0 { near[axis] } else { t0 };
             t1 = if far[axis] < t1 { far[axis] } else { t1 };
         }
-        (t0 < t1).then_some([t0, t1])
+        (t0 < t1).then_some(Entered { origin, direction, interval: [t0, t1] })
     }
 
     /// The ray in positions of this field, with t = 0 moved to the distance `start`.
     pub fn local(&self, ray: &Ray, start: f64) -> LocalRay {
         let origin = self.index_from_world * (ray.origin + ray.direction * start) + self.offset;
         LocalRay::new(origin.as_vec3(), (self.index_from_world * ray.direction).as_vec3())
-    }
-
-    /// Voxels per world length along a ray.
-    pub(crate) fn voxels_per_length(&self, ray: &Ray) -> f64 {
-        (self.index_from_world * ray.direction).length()
     }
 
     /// Takes directions of the world to positions of this field.
@@ -264,6 +268,20 @@ impl<'a> Field<'a> {
         };
         runs.aim();
         runs
+    }
+}
+
+impl Entered {
+    /// The ray in positions of the field, with t = 0 moved to the distance `start`.
+    #[inline(always)]
+    pub(crate) fn local(&self, start: f64) -> LocalRay {
+        LocalRay::new((self.origin + self.direction * start).as_vec3(), self.direction.as_vec3())
+    }
+
+    /// Voxels per world length.
+    #[inline(always)]
+    pub(crate) fn voxels_per_length(&self) -> f64 {
+        self.direction.length()
     }
 }
 
@@ -356,8 +374,9 @@ impl Runs<'_, '_> {
         None
     }
 
-    /// The next brick or homogeneous part of a tile that is not empty. To be used instead of the iterator.
-    pub(crate) fn next_brick(&mut self) -> Option<BrickSpan> {
+    /// The next brick or homogeneous part of a tile that is not empty, with the brick in which it begins. To be used instead of
+    /// the iterator.
+    pub(crate) fn next_brick(&mut self) -> Option<(BrickSpan, IVec3)> {
         while self.t < self.t_end {
             let (t0, brick) = (self.t, self.brick);
             let content = match self.accessor.place(brick) {
@@ -365,7 +384,7 @@ impl Runs<'_, '_> {
                     self.step_brick();
                     let bounds = self.accessor.tree().node4.footprints[entry];
                     match u32::try_from(entry) {
-                        Ok(entry) if !bounds.is_constant() => SpanContent::Entry(entry),
+                        Ok(entry) if !bounds.is_constant() => SpanContent::Brick(entry),
                         _ => SpanContent::Constant(bounds.max),
                     }
                 }
@@ -378,10 +397,15 @@ impl Runs<'_, '_> {
             let t1 = self.t.min(self.t_end);
             if content != SpanContent::Constant(0.0) && t0 < t1 {
                 let corner = brick.wrapping_sub(self.base_brick).as_vec3() * 8.0;
-                return Some(BrickSpan { t0, t1, corner, content });
+                return Some((BrickSpan { t0, t1, corner, content }, brick));
             }
         }
         None
+    }
+
+    /// What the voxels of a brick are.
+    pub(crate) fn voxels_of(&mut self, brick: IVec3) -> SpanContent {
+        voxels_of(self.accessor, brick)
     }
 
     /// Moves on through a tile as far as it has one value, or by one brick of the layer that blends with the neighbours.

@@ -1,30 +1,30 @@
 //! The walk of a ray over a flat map of bricks: what [`Runs`] does through the tree, for kernels in which the walk is most
 //! of the work.
 //!
-//! A [`BrickMap`] says for each brick of a field's box which entry it has, or how many bricks around it are empty (Cohen &
+//! A ray crosses at most one face along each of its two slower axes while it goes from one lattice plane of its fastest axis to
+//! the next. So it falls into [`Slabs`] of at most three stretches that do not depend on each other, and eight slabs are
+//! done at once: layers of bricks here, voxels in [`depth`](crate::depth).
+//!
+//! A [`BrickMap`] says for each brick of a field's box what it holds, or how many bricks around it are empty (Cohen &
 //! Sheffer, "Proximity Clouds – an Acceleration Technique for 3D Grid Traversal", 1994). A field whose box is too large for one
 //! is walked by its tree; both give the same [`BrickSpan`]s.
 
-use fearless_simd::{Simd, f32x4, i32x4, mask32x4, prelude::*};
+use fearless_simd::{Simd, f32x8, i32x8, prelude::*};
 use glam::{IVec3, Vec3};
 use nuage_volume::accessor::{Accessor, BrickPlace};
-use nuage_volume::brick::Bounds;
 use nuage_volume::tree::Content;
 
-use crate::traverse::{Field, LocalRay, Runs, floor};
+use crate::simd::each_lane;
+use crate::traverse::{LocalRay, Runs, floor};
 
 /// The most bricks of a map: 16 MiB.
 const MOST_CELLS: i64 = 1 << 22;
 
-/// A ray leaps where this many layers of bricks around it are empty; where there are fewer, steps are faster.
-const LEAST_LEAP: u32 = 5;
+/// A ray leaps where it is this far from bricks that are not empty.
+const LEAST_LEAP: i32 = 4;
 
-/// Cells of a map from here on have no entry to be read.
-const NO_ENTRY: u32 = 0xffff_fe00;
-/// The brick has one value other than zero, or lies in a tile.
-const SPECIAL: u32 = 0xffff_fe00;
-/// The brick is empty, as are all those less than `cell - EMPTY` away along each axis.
-const EMPTY: u32 = 0xffff_ff00;
+/// Cells of a map from here on are indices of contents of other kinds than a brick's.
+const SPECIAL: i32 = 1 << 30;
 /// The furthest that is told of an empty brick.
 const FURTHEST: u8 = 255;
 
@@ -33,10 +33,19 @@ const FURTHEST: u8 = 255;
 pub(crate) enum SpanContent {
     /// One value.
     Constant(f32),
-    /// The brick of this entry.
-    Entry(u32),
-    /// A brick of a tile that blends with the tile's neighbours.
+    /// The brick of this entry; on a walk over voxels, the brick of this number.
+    Brick(u32),
+    /// A brick of a tile that blends with the tile's neighbours. Does not occur on a walk over voxels.
     TileBorder,
+}
+
+/// What a ray looks for in bricks.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Sight {
+    /// Cells between voxels, which reach into the next bricks.
+    Cells,
+    /// The voxels of each brick by themselves.
+    Voxels,
 }
 
 /// A stretch of a ray.
@@ -56,14 +65,15 @@ pub(crate) struct BrickSpan {
 ///
 /// A macro, so that the loop is made for each of the two and inlined where the vector instructions are known.
 macro_rules! with_spans {
-    ($simd:expr, $field:expr, $walker:expr, $local:expr, $length:expr, |$spans:ident| $work:expr) => {
-        match $field.map() {
+    ($simd:expr, $sight:expr, $field:expr, $walker:expr, $ray:expr, $length:expr, |$spans:ident| $work:expr) => {
+        match $field.map($sight) {
             Some(map) => {
-                let $spans = crate::walk::MapWalk::new($simd, map, $field, $walker, $local, 0.0, $length);
+                let $spans = crate::walk::MapWalk::new($simd, map, $ray, $length);
                 $work
             }
             None => {
-                let $spans = $field.runs($walker, $local, 0.0, $length);
+                let runs = $field.runs($walker, $ray.local, 0.0, $length);
+                let $spans = crate::walk::TreeWalk { runs, sight: $sight };
                 $work
             }
         }
@@ -77,24 +87,50 @@ pub(crate) trait Spans {
     fn next_span(&mut self) -> Option<BrickSpan>;
 }
 
-impl Spans for Runs<'_, '_> {
+/// The spans of a ray by its tree.
+pub(crate) struct TreeWalk<'r, 'a> {
+    pub(crate) runs: Runs<'r, 'a>,
+    pub(crate) sight: Sight,
+}
+
+impl Spans for TreeWalk<'_, '_> {
     #[inline(always)]
     fn next_span(&mut self) -> Option<BrickSpan> {
-        self.next_brick()
+        loop {
+            let (span, brick) = self.runs.next_brick()?;
+            if self.sight == Sight::Cells {
+                return Some(span);
+            }
+            let content = match span.content {
+                // Where interpolation sees one value, voxels have no other.
+                SpanContent::Constant(value) => SpanContent::Constant(value),
+                _ => self.runs.voxels_of(brick),
+            };
+            if content != SpanContent::Constant(0.0) {
+                return Some(BrickSpan { content, ..span });
+            }
+        }
     }
 }
 
 /// What stands in each brick of a box.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct BrickMap {
-    /// By `(x * size.y + y) * size.z + z`, with a layer of empty bricks all around.
-    cells: Box<[u32]>,
+    /// By `(x * size.y + y) * size.z + z`, with a layer of empty bricks all around. Below 0 the brick is empty, as are all those
+    /// less than `-cell` away along each axis. From [`SPECIAL`] on it is the index of a content; else that of a brick.
+    cells: Box<[i32]>,
     size: IVec3,
+    specials: Vec<SpanContent>,
 }
 
 impl BrickMap {
     /// The map of the bricks from `first` to `last`. `None` if there are too many.
-    pub(crate) fn new(accessor: &mut Accessor<'_>, first: IVec3, last: IVec3) -> Option<BrickMap> {
+    pub(crate) fn new(
+        accessor: &mut Accessor<'_>,
+        sight: Sight,
+        first: IVec3,
+        last: IVec3,
+    ) -> Option<BrickMap> {
         let size = last.as_i64vec3() - first.as_i64vec3() + 3;
         // Each axis by itself first, so that the product does not overflow.
         if size.max_element() > MOST_CELLS || size.element_product() > MOST_CELLS {
@@ -102,45 +138,87 @@ impl BrickMap {
         }
         let size = size.as_ivec3();
         let mut distances = vec![FURTHEST; size.element_product() as usize];
-        let mut cells = vec![EMPTY; distances.len()];
+        let mut cells = vec![0; distances.len()];
+        let mut specials = Vec::new();
         for x in 1..size.x - 1 {
             for y in 1..size.y - 1 {
                 for z in 1..size.z - 1 {
-                    let cell = cell_of(accessor, first + IVec3::new(x, y, z) - 1);
-                    let at = ((x * size.y + y) * size.z + z) as usize;
-                    cells[at] = cell;
-                    if cell < EMPTY {
-                        distances[at] = 0;
+                    let content = content_of(accessor, sight, first + IVec3::new(x, y, z) - 1);
+                    if content == SpanContent::Constant(0.0) {
+                        continue;
                     }
+                    let at = ((x * size.y + y) * size.z + z) as usize;
+                    distances[at] = 0;
+                    cells[at] = match content {
+                        SpanContent::Brick(index) if index < SPECIAL as u32 => index as i32,
+                        // Neighbours often hold the same. There are fewer contents than cells.
+                        _ => {
+                            if specials.last() != Some(&content) {
+                                specials.push(content);
+                            }
+                            SPECIAL + specials.len() as i32 - 1
+                        }
+                    };
                 }
             }
         }
         chessboard_distances(&mut distances, size);
         for (cell, distance) in cells.iter_mut().zip(distances) {
-            if *cell == EMPTY {
-                *cell = EMPTY | u32::from(distance);
+            if distance > 0 {
+                *cell = -i32::from(distance);
             }
         }
-        Some(BrickMap { cells: cells.into(), size })
+        Some(BrickMap { cells: cells.into(), size, specials })
     }
 
     /// How far apart neighbours along each axis are.
-    fn strides(&self) -> IVec3 {
-        IVec3::new(self.size.y * self.size.z, self.size.z, 1)
+    fn strides(&self) -> [i32; 3] {
+        [self.size.y * self.size.z, self.size.z, 1]
+    }
+
+    #[inline(always)]
+    fn cell(&self, at: i32) -> i32 {
+        self.cells.get(at as usize).copied().unwrap_or(-1)
     }
 }
 
-/// What a map says of a brick.
-fn cell_of(accessor: &mut Accessor<'_>, brick: IVec3) -> u32 {
-    let (bounds, entry) = match accessor.place(brick) {
-        BrickPlace::Entry(entry) => (accessor.tree().node4.footprints[entry], Some(entry)),
-        BrickPlace::Zero => return EMPTY,
-        BrickPlace::Tile => (accessor.footprint(brick).1, None),
-    };
-    match entry {
-        _ if bounds == Bounds::of(0.0) => EMPTY,
-        Some(entry) if !bounds.is_constant() && (entry as u64) < u64::from(NO_ENTRY) => entry as u32,
-        _ => SPECIAL,
+/// What a brick holds.
+fn content_of(accessor: &mut Accessor<'_>, sight: Sight, brick: IVec3) -> SpanContent {
+    match sight {
+        Sight::Cells => cells_of(accessor, brick),
+        Sight::Voxels => voxels_of(accessor, brick),
+    }
+}
+
+/// What the cells hold that begin in a brick.
+fn cells_of(accessor: &mut Accessor<'_>, brick: IVec3) -> SpanContent {
+    match accessor.place(brick) {
+        BrickPlace::Zero => SpanContent::Constant(0.0),
+        BrickPlace::Entry(entry) => {
+            let bounds = accessor.tree().node4.footprints[entry];
+            match u32::try_from(entry) {
+                Ok(entry) if !bounds.is_constant() => SpanContent::Brick(entry),
+                _ => SpanContent::Constant(bounds.max),
+            }
+        }
+        BrickPlace::Tile => {
+            let region = accessor.region(brick);
+            let last = (1 << region.log2_bricks) - 1;
+            let is_inner = (brick & last).cmplt(IVec3::splat(last)).all();
+            match region.content {
+                _ if region.footprint.is_constant() => SpanContent::Constant(region.footprint.max),
+                Content::Constant(value) if is_inner => SpanContent::Constant(value),
+                _ => SpanContent::TileBorder,
+            }
+        }
+    }
+}
+
+/// What the voxels of a brick are.
+pub(crate) fn voxels_of(accessor: &mut Accessor<'_>, brick: IVec3) -> SpanContent {
+    match accessor.region(brick).content {
+        Content::Constant(value) => SpanContent::Constant(value),
+        Content::Brick(number) => SpanContent::Brick(number),
     }
 }
 
@@ -174,218 +252,303 @@ fn chessboard_distances(distances: &mut [u8], size: IVec3) {
     sweep(slice, x, &|line| line, y * z);
 }
 
-/// The faces of a lattice that a ray is about to cross, one for each axis.
-pub(crate) struct Faces<S: Simd> {
-    /// Where the ray crosses them; the last lane is never.
-    next: f32x4<S>,
-    /// From face to face.
-    spacing: f32x4<S>,
+/// A ray with its axes in another order: the one along which it is fastest, and the other two.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct SortedRay {
+    /// The ray as it was.
+    pub(crate) local: LocalRay,
+    order: Order,
+    origin: [f32; 3],
+    direction: [f32; 3],
+    inverse: [f32; 3],
 }
 
-impl<S: Simd> Faces<S> {
+/// Which axis comes first; the others follow as they do in a circle.
+#[derive(Debug, Clone, Copy)]
+pub(crate) enum Order {
+    Xyz,
+    Yzx,
+    Zxy,
+}
+
+impl Order {
+    /// From x, y, z to this order.
     #[inline(always)]
-    pub(crate) fn new(simd: S, next: [f32; 3], spacing: Vec3) -> Self {
-        let spacing = [spacing.x, spacing.y, spacing.z, 0.0];
-        Faces { next: Self::lanes(simd, next), spacing: f32x4::simd_from(simd, spacing) }
+    pub(crate) fn sorted<T>(self, [x, y, z]: [T; 3]) -> [T; 3] {
+        match self {
+            Order::Xyz => [x, y, z],
+            Order::Yzx => [y, z, x],
+            Order::Zxy => [z, x, y],
+        }
+    }
+
+    /// From this order to x, y, z.
+    #[inline(always)]
+    fn restored<T>(self, [a, b, c]: [T; 3]) -> [T; 3] {
+        match self {
+            Order::Xyz => [a, b, c],
+            Order::Yzx => [c, a, b],
+            Order::Zxy => [b, c, a],
+        }
+    }
+}
+
+impl SortedRay {
+    #[inline(always)]
+    pub(crate) fn new(local: LocalRay) -> SortedRay {
+        let speed = local.direction.abs();
+        let order = match speed.x >= speed.y && speed.x >= speed.z {
+            true => Order::Xyz,
+            false if speed.y >= speed.z => Order::Yzx,
+            false => Order::Zxy,
+        };
+        SortedRay {
+            local,
+            order,
+            origin: order.sorted(local.origin.to_array()),
+            direction: order.sorted(local.direction.to_array()),
+            inverse: order.sorted(local.inverse().to_array()),
+        }
+    }
+
+    /// The order of its axes.
+    #[inline(always)]
+    pub(crate) fn order(&self) -> Order {
+        self.order
+    }
+
+    /// The same in units of bricks.
+    #[inline(always)]
+    fn in_bricks(self) -> SortedRay {
+        let ([o0, o1, o2], [d0, d1, d2], [i0, i1, i2]) = (self.origin, self.direction, self.inverse);
+        SortedRay {
+            origin: [o0 * 0.125, o1 * 0.125, o2 * 0.125],
+            direction: [d0 * 0.125, d1 * 0.125, d2 * 0.125],
+            inverse: [i0 * 8.0, i1 * 8.0, i2 * 8.0],
+            ..self
+        }
+    }
+
+    /// The same seen from another place.
+    #[inline(always)]
+    pub(crate) fn seen_from(&self, corner: Vec3) -> SortedRay {
+        SortedRay { origin: self.order.sorted((self.local.origin - corner).to_array()), ..*self }
     }
 
     #[inline(always)]
-    fn lanes(simd: S, [x, y, z]: [f32; 3]) -> f32x4<S> {
-        f32x4::simd_from(simd, [x, y, z, f32::INFINITY])
+    pub(crate) fn is_forward(&self) -> bool {
+        self.direction[0] >= 0.0
+    }
+}
+
+/// Eight slabs of a lattice in the order in which a ray goes through them.
+pub(crate) struct Slabs<S: Simd> {
+    /// Which slab it is along the fastest axis.
+    pub(crate) number: i32x8<S>,
+    /// Where the ray enters the slab, crosses a first and a second face in it, and leaves it: ascending, and the last for faces
+    /// that it does not cross.
+    pub(crate) t: [f32x8<S>; 4],
+    /// The cells of the three stretches between, along the other two axes.
+    pub(crate) across: [[i32x8<S>; 2]; 3],
+}
+
+impl<S: Simd> Slabs<S> {
+    /// The slabs from `first` on, in lattice units of the ray, as far as they lie between `t0` and `t1`; cells across are held
+    /// between 0 and `last`.
+    #[inline(always)]
+    pub(crate) fn of(simd: S, ray: &SortedRay, first: f32, [t0, t1]: [f32; 2], last: f32) -> Self {
+        let lanes = f32x8::simd_from(simd, [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0]);
+        let (sign, behind) = if ray.is_forward() { (1.0, 0.0) } else { (-1.0, 1.0) };
+        let number = lanes * sign + first;
+        // The same numbers where slabs meet: faces are whole.
+        let (enter, leave) = (number + behind, number + (behind + sign));
+        let enter = ((enter - ray.origin[0]) * ray.inverse[0]).max(t0).min(t1);
+        let leave = ((leave - ray.origin[0]) * ray.inverse[0]).max(t0).min(t1);
+        let (u0, u1, t_u) = Self::cross(ray, 1, enter, leave, last);
+        let (v0, v1, t_v) = Self::cross(ray, 2, enter, leave, last);
+        let u_first = t_u.simd_lt(t_v);
+        let between = [u_first.select(u1, u0), u_first.select(v0, v1)];
+        Slabs {
+            number: number.to_int(),
+            t: [enter, t_u.min(t_v), t_u.max(t_v), leave],
+            across: [[u0, v0], between, [u1, v1]],
+        }
     }
 
-    /// Goes through the nearest face, or through several that meet in an edge. Returns where, and along which axes.
+    /// The cells along an axis at both ends of slabs, and where the ray crosses the face between them, if there is one.
     #[inline(always)]
-    pub(crate) fn pass(&mut self) -> (f32, mask32x4<S>) {
-        // Floats that are not negative are ordered as their bits are, and integers take fewer cycles.
-        let bits = self.next.bitcast::<i32x4<S>>();
-        let nearest = bits.min(bits.rotate_elements_left::<1>());
-        let nearest = nearest.min(nearest.rotate_elements_left::<2>());
-        let axes = bits.simd_eq(nearest);
-        self.next = axes.select(self.next + self.spacing, self.next);
-        (f32::from_bits(nearest[0] as u32), axes)
+    fn cross(
+        ray: &SortedRay,
+        axis: usize,
+        enter: f32x8<S>,
+        leave: f32x8<S>,
+        last: f32,
+    ) -> (i32x8<S>, i32x8<S>, f32x8<S>) {
+        let (origin, direction) = (ray.origin[axis], ray.direction[axis]);
+        // Truncation, since nothing is below 0 but by rounding.
+        let before = (enter * direction + origin).min(last).to_int::<i32x8<S>>();
+        let behind = (leave * direction + origin).min(last).to_int::<i32x8<S>>();
+        let face = before.to_float::<f32x8<S>>() + if direction >= 0.0 { 1.0 } else { 0.0 };
+        let crossing = ((face - origin) * ray.inverse[axis]).max(enter).min(leave);
+        (before, behind, before.simd_eq(behind).select(leave, crossing))
     }
+
+    /// The stretches that are not empty: bit `4 * slab + stretch`.
+    #[inline(always)]
+    pub(crate) fn stretches(&self) -> u32 {
+        let parts = [
+            self.t[0].simd_lt(self.t[1]).to_bitmask() as u32,
+            self.t[1].simd_lt(self.t[2]).to_bitmask() as u32,
+            self.t[2].simd_lt(self.t[3]).to_bitmask() as u32,
+        ];
+        spread(parts[0]) | spread(parts[1]) << 1 | spread(parts[2]) << 2
+    }
+}
+
+/// Moves bit i of the lowest eight to 4 i. A table, for there are as many uses as brick layers.
+#[inline(always)]
+fn spread(bits: u32) -> u32 {
+    const TABLE: [u32; 256] = {
+        let mut table = [0; 256];
+        let mut i = 0;
+        while i < 8 * 256 {
+            table[i / 8] |= ((i as u32 / 8) >> (i % 8) & 1) << (4 * (i % 8));
+            i += 1;
+        }
+        table
+    };
+    TABLE[bits as usize % 256]
 }
 
 /// A ray on its way through a [`BrickMap`].
-pub(crate) struct MapWalk<'w, 'a, S: Simd> {
+pub(crate) struct MapWalk<'w, S: Simd> {
     simd: S,
     map: &'w BrickMap,
-    field: &'w Field<'a>,
-    accessor: &'w mut Accessor<'a>,
-    ray: LocalRay,
-    t: f32,
+    /// In units of bricks.
+    ray: SortedRay,
+    t_start: f32,
     t_end: f32,
-    faces: Faces<S>,
-    /// The first voxel of the brick.
-    corner: f32x4<S>,
-    corner_step: f32x4<S>,
-    /// The place of the brick in the map: what each axis adds to it, and from brick to brick.
-    cell: i32x4<S>,
-    stride: i32x4<S>,
+    /// The next layer of bricks, and the first one outside of the map at the end of the way.
+    layer: f32,
+    layers_end: f32,
+    /// How far apart neighbours lie in the map. Their places are whole numbers that floats hold.
+    strides: [f32; 3],
+    /// The stretches found and not yet given out, as [`Slabs::stretches`] numbers them.
+    waiting: u32,
+    /// What is known of them, at `8 * stretch + slab`.
+    t: [f32; 32],
+    cells: [i32; 24],
+    /// Their bricks, in the order of the ray's axes.
+    bricks: [[i32; 24]; 3],
 }
 
-/// Where a walk stands.
-#[derive(Clone, Copy)]
-struct Place {
-    next: [f32; 3],
-    corner: [f32; 4],
-    cell: [i32; 4],
-}
-
-impl<'w, 'a, S: Simd> MapWalk<'w, 'a, S> {
-    /// The walk of a ray between `t0` and `t1`, both inside the field.
+impl<'w, S: Simd> MapWalk<'w, S> {
+    /// The walk of a ray from t = 0 to `length`, both inside the field.
     #[inline(always)]
-    pub(crate) fn new(
-        simd: S,
-        map: &'w BrickMap,
-        field: &'w Field<'a>,
-        accessor: &'w mut Accessor<'a>,
-        ray: LocalRay,
-        t0: f32,
-        t1: f32,
-    ) -> Self {
-        let position = ray.at(t0) * 0.125;
-        let brick = IVec3::new(floor(position.x), floor(position.y), floor(position.z));
-        let place = Place::of(map, &ray, brick.clamp(IVec3::ONE, map.size - 2));
-        let sign = IVec3::select(ray.direction.cmpge(Vec3::ZERO), IVec3::ONE, IVec3::NEG_ONE);
-        let stride = map.strides() * sign;
-        let [x, y, z] = (8.0 * sign.as_vec3()).to_array();
+    pub(crate) fn new(simd: S, map: &'w BrickMap, ray: &SortedRay, length: f32) -> Self {
+        let ray = ray.in_bricks();
+        let [layers, ..] = ray.order.sorted(map.size.to_array());
+        let [x, y, z] = map.strides();
         MapWalk {
             simd,
             map,
-            field,
-            accessor,
             ray,
-            t: t0,
-            t_end: t1,
-            faces: Faces::new(simd, place.next, (8.0 * ray.inverse()).abs()),
-            corner: f32x4::simd_from(simd, place.corner),
-            corner_step: f32x4::simd_from(simd, [x, y, z, 0.0]),
-            cell: i32x4::simd_from(simd, place.cell),
-            stride: i32x4::simd_from(simd, [stride.x, stride.y, stride.z, 0]),
+            t_start: 0.0,
+            t_end: length,
+            layer: floor(ray.origin[0]).clamp(1, layers - 2) as f32,
+            layers_end: if ray.is_forward() { layers as f32 } else { -1.0 },
+            strides: ray.order.sorted([x as f32, y as f32, z as f32]),
+            waiting: 0,
+            t: [0.0; 32],
+            cells: [0; 24],
+            bricks: [[0; 24]; 3],
         }
     }
 
-    /// Moves on to the next brick, or diagonally through an edge.
+    /// Goes on to where bricks are not far. False if the ray ends before.
     #[inline(always)]
-    fn step(&mut self) {
-        let (t, axes) = self.faces.pass();
-        self.corner += axes.select(self.corner_step, f32x4::splat(self.simd, 0.0));
-        self.cell += axes.select(self.stride, i32x4::splat(self.simd, 0));
-        self.t = if t > self.t { t } else { self.t };
+    fn approach(&mut self) -> bool {
+        let (ray, [along, u, v]) = (&self.ray, self.strides);
+        let (sign, behind) = if ray.is_forward() { (1.0, 0.0) } else { (-1.0, 1.0) };
+        loop {
+            let t = (self.layer + behind - ray.origin[0]) * ray.inverse[0];
+            let t = if t > self.t_start { t } else { self.t_start };
+            if t >= self.t_end || self.layer == self.layers_end {
+                return false;
+            }
+            let brick_u = (ray.origin[1] + ray.direction[1] * t).trunc();
+            let brick_v = (ray.origin[2] + ray.direction[2] * t).trunc();
+            // Added to 2^23, a smaller whole number stands in the low bits: cheaper than a conversion that must saturate.
+            let at = (self.layer * along + brick_u * u + brick_v * v + 8_388_608.0).to_bits() & 0x7f_ffff;
+            let distance = -self.map.cell(at as i32);
+            self.t_start = t;
+            if distance < LEAST_LEAP {
+                return true;
+            }
+            // Bricks less than `distance` away are empty, and other than along the fastest axis the ray changes by at most
+            // one in this layer and in each that follows.
+            let layer = self.layer + sign * (distance - 1) as f32;
+            self.layer = if sign > 0.0 { layer.min(self.layers_end) } else { layer.max(self.layers_end) };
+        }
     }
 
-    /// Moves on to where the ray leaves the bricks that are at most `reach` away.
+    /// Looks at the next eight layers.
     #[inline(always)]
-    fn leap(&mut self, reach: [IVec3; 2]) {
+    fn look(&mut self) {
         // A copy: what a call might change through a reference, the compiler keeps in memory.
-        let ray = self.ray;
-        let (t, place) = Place::behind(self.map, &ray, self.corner.to_array(), reach);
-        self.t = if t > self.t { t } else { self.t };
-        self.faces.next = Faces::lanes(self.simd, place.next);
-        self.corner = f32x4::simd_from(self.simd, place.corner);
-        self.cell = i32x4::simd_from(self.simd, place.cell);
-    }
-
-    /// What the map says of the brick.
-    #[inline(always)]
-    fn read(&self) -> Option<u32> {
-        let pairs = self.cell + self.cell.rotate_elements_left::<1>();
-        let all = pairs + pairs.rotate_elements_left::<2>();
-        self.map.cells.get(all[0] as usize).copied()
-    }
-}
-
-impl Place {
-    #[inline(always)]
-    fn of(map: &BrickMap, ray: &LocalRay, brick: IVec3) -> Place {
-        let corner = brick.as_vec3() * 8.0;
-        let far = Vec3::select(ray.direction.cmpge(Vec3::ZERO), corner + 8.0, corner);
-        let t = (far - ray.origin) * ray.inverse();
-        let t = Vec3::select(ray.direction.cmpeq(Vec3::ZERO), Vec3::INFINITY, t);
-        let cell = brick * map.strides();
-        Place {
-            next: t.to_array(),
-            corner: [corner.x, corner.y, corner.z, 0.0],
-            cell: [cell.x, cell.y, cell.z, 0],
-        }
-    }
-
-    /// Where a ray leaves a box of bricks around the one at a corner, how many below and above it, and the brick behind.
-    #[inline(never)]
-    fn behind(map: &BrickMap, ray: &LocalRay, corner: [f32; 4], [below, above]: [IVec3; 2]) -> (f32, Place) {
-        let brick = (Vec3::new(corner[0], corner[1], corner[2]) * 0.125).as_ivec3();
-        let (low, high) = (brick - below, brick + above);
-        let forward = ray.direction.cmpge(Vec3::ZERO);
-        let faces = IVec3::select(forward, high + 1, low).as_vec3() * 8.0;
-        let t = (faces - ray.origin) * ray.inverse();
-        let t = Vec3::select(ray.direction.cmpeq(Vec3::ZERO), Vec3::INFINITY, t);
-        let axis = t.min_position();
-        let position = ray.at(t[axis]) * 0.125;
-        let behind = IVec3::new(floor(position.x), floor(position.y), floor(position.z));
-        let mut behind = behind.clamp(low, high);
-        // The axis of the exit moves by the integers, so that the walk never stands still.
-        behind[axis] = if forward.test(axis) { high[axis] + 1 } else { low[axis] - 1 };
-        // Beyond the box lies nothing, and the walk ends where the field does.
-        let inside = behind.cmpge(IVec3::ZERO).all() && behind.cmplt(map.size).all();
-        match inside {
-            true => (t[axis], Place::of(map, ray, behind)),
-            false => (f32::INFINITY, Place::of(map, ray, IVec3::ZERO)),
-        }
-    }
-}
-
-impl<S: Simd> Spans for MapWalk<'_, '_, S> {
-    #[inline(always)]
-    fn next_span(&mut self) -> Option<BrickSpan> {
-        while self.t < self.t_end {
-            let (t0, corner) = (self.t, self.corner);
-            let cell = self.read()?;
-            if cell >= EMPTY {
-                let distance = cell - EMPTY;
-                match distance >= LEAST_LEAP {
-                    true => self.leap([IVec3::splat(distance as i32 - 1); 2]),
-                    false => self.step(),
-                }
+        let (ray, [along, u, v]) = (self.ray, self.strides);
+        let limits = [self.t_start, self.t_end];
+        let slabs = Slabs::of(self.simd, &ray, self.layer, limits, f32::INFINITY);
+        let layers = slabs.number.to_float::<f32x8<S>>() * along;
+        let mut waiting = slabs.stretches();
+        // Counted, since iterators over vectors are not always inlined.
+        for i in 0..3 {
+            slabs.t[i].store_slice(&mut self.t[8 * i..8 * i + 8]);
+            if waiting & 0x1111_1111 << i == 0 {
                 continue;
             }
-            let mut content = SpanContent::Entry(cell);
-            if cell >= NO_ENTRY {
-                let [x, y, z, _] = corner.to_array();
-                let (special, reach) = special(self.field, self.accessor, Vec3::new(x, y, z));
-                content = special;
-                self.leap(reach);
-            } else {
-                self.step();
-            }
-            let t1 = if self.t < self.t_end { self.t } else { self.t_end };
-            if t0 < t1 {
-                let [x, y, z, _] = corner.to_array();
-                return Some(BrickSpan { t0, t1, corner: Vec3::new(x, y, z), content });
-            }
+            let across = slabs.across[i];
+            let at = layers + across[0].to_float::<f32x8<S>>() * u + across[1].to_float::<f32x8<S>>() * v;
+            let at = at.to_int::<i32x8<S>>().to_array();
+            let cells = i32x8::simd_from(self.simd, each_lane!(|lane| self.map.cell(at[lane])));
+            let empty = cells.simd_lt(i32x8::splat(self.simd, 0)).to_bitmask() as u32;
+            waiting &= !(spread(empty) << i);
+            cells.store_slice(&mut self.cells[8 * i..8 * i + 8]);
+            slabs.number.store_slice(&mut self.bricks[0][8 * i..8 * i + 8]);
+            across[0].store_slice(&mut self.bricks[1][8 * i..8 * i + 8]);
+            across[1].store_slice(&mut self.bricks[2][8 * i..8 * i + 8]);
         }
-        None
+        slabs.t[3].store_slice(&mut self.t[24..]);
+        self.waiting = waiting;
+        self.t_start = self.t[31];
+        // Not beyond the map, where the walk ends.
+        self.layer = match ray.is_forward() {
+            true => (self.layer + 8.0).min(self.layers_end),
+            false => (self.layer - 8.0).max(self.layers_end),
+        };
     }
 }
 
-/// What a brick without an entry to be read holds, and how many bricks below and above it hold the same.
-#[inline(never)]
-fn special(field: &Field<'_>, accessor: &mut Accessor<'_>, corner: Vec3) -> (SpanContent, [IVec3; 2]) {
-    let brick = field.brick_at(corner);
-    let single = [IVec3::ZERO; 2];
-    if let BrickPlace::Entry(entry) = accessor.place(brick) {
-        return (SpanContent::Constant(accessor.tree().node4.footprints[entry].max), single);
-    }
-    let region = accessor.region(brick);
-    let bricks = 1 << region.log2_bricks;
-    let local = brick & (bricks - 1);
-    let (below, above) = (local, bricks - 1 - local);
-    match region.content {
-        _ if region.footprint.is_constant() => (SpanContent::Constant(region.footprint.max), [below, above]),
-        Content::Constant(value) if above.cmpgt(IVec3::ZERO).all() => {
-            (SpanContent::Constant(value), [below, above - 1])
+impl<S: Simd> Spans for MapWalk<'_, S> {
+    #[inline(always)]
+    fn next_span(&mut self) -> Option<BrickSpan> {
+        while self.waiting == 0 {
+            if !self.approach() {
+                return None;
+            }
+            self.look();
         }
-        _ => (SpanContent::TileBorder, single),
+        let number = self.waiting.trailing_zeros();
+        self.waiting &= self.waiting - 1;
+        // Stretches are 0 to 2, so the highest index is 23.
+        let at = ((number & 3) * 8 + (number >> 2)) as usize % 24;
+        let cell = self.cells[at];
+        let content = match cell < SPECIAL {
+            true => SpanContent::Brick(cell as u32),
+            false => self.map.specials[(cell - SPECIAL) as usize],
+        };
+        let brick = [self.bricks[0][at], self.bricks[1][at], self.bricks[2][at]];
+        let corner = IVec3::from_array(self.ray.order.restored(brick)).as_vec3() * 8.0;
+        Some(BrickSpan { t0: self.t[at], t1: self.t[at + 8], corner, content })
     }
 }
