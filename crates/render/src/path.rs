@@ -10,11 +10,17 @@
 //! et al., "Hero Wavelength Spectral Sampling", 2014; Miller et al., "A null-scattering path integral formulation of light
 //! transport", 2019); no weight can exceed 3.
 //!
-//! At each collision the light of each light and of the sky is taken with a transmittance by residual ratio tracking (Novák
-//! et al., "Residual Ratio Tracking for Estimating Attenuation in Participating Media", 2014). Of a light with extent, a
-//! direction is taken evenly from what is seen of it, or, where the phase function is narrower than the light, from either
-//! with even chances, weighed by the balance heuristic; of a sky that is a picture always from either (Veach, "Robust Monte Carlo Methods for Light Transport Simulation",
-//! 1997). Paths end by Russian roulette.
+//! At each collision the light of each light, and of a sky that is a picture, is taken with a transmittance by residual ratio
+//! tracking (Novák et al., "Residual Ratio Tracking for Estimating Attenuation in Participating Media", 2014). Of a light with
+//! extent, a direction is taken evenly from what is seen of it, or, where the phase function is narrower than the light, from
+//! either with even chances, weighed by the balance heuristic; of a sky that is a picture always from either (Veach, "Robust
+//! Monte Carlo Methods for Light Transport Simulation", 1997). Other skies are seen by paths that leave the media: with most of
+//! their weight left, whatever way they went, which is quieter than a sum over collisions. Paths end by Russian roulette.
+//!
+//! Two control variates make suns cheap and quiet where all media are grey. Most collisions take the sun's transmittance from
+//! a lattice ([`crate::shade`]), and the few that follow a ray, an exact one, count with what they find beside it for the
+//! others. And of what a direction of scattering makes more likely to be found by the next collisions, the expected part is
+//! taken off, whose mean is 0 ([`expected_later`]).
 //!
 //! What does not live here: pixels, threads, pictures ([`crate::picture`]).
 
@@ -27,8 +33,9 @@ use crate::depth::optical_depth;
 use crate::envmap::EnvironmentMap;
 use crate::filter::Filter;
 use crate::hash::{hash_u32, unit_f32};
-use crate::light::{Arriving, Light, Sky};
+use crate::light::{Arriving, Light, Sky, Sun};
 use crate::math::{exp, ln};
+use crate::phase::MAX_ASYMMETRY;
 use crate::scene::{Phase, Scene, Shape, Spectrum, Volume};
 use crate::shade::{Caster, Shade, Shaded};
 use crate::solid::Solid;
@@ -40,8 +47,8 @@ use crate::traverse::{Field, LocalRay, Reader, Runs, Segment};
 pub struct PathSettings {
     /// How often light may scatter before it reaches the camera; as often as it does if `None`.
     pub max_scatterings: Option<u32>,
-    /// Whether each collision looks for the sky with a ray of its own. Else only paths that leave the medium see it. The
-    /// other lights can be seen in no other way.
+    /// Whether each collision looks with a ray of its own for a sky that is a picture. Else only paths that leave the medium
+    /// see it, as they do skies of other kinds. The other lights can be seen in no other way.
     pub sky_rays: bool,
 }
 
@@ -65,6 +72,9 @@ const LEAST_SHADOW_RAYS: f32 = 0.04;
 /// from node to node, and where half of the light passes. Fewer save little time, for by far the most of it goes to collisions.
 const SHADE_EDGES: f32 = 4.0;
 const SHADE_HALVES: f32 = 0.5;
+
+/// Of the light of a sun that scatters once more and then again and again, what counts in [`expected_later`]: by trial.
+const LATER_LOBES: [f32; 3] = [1.2, 0.72, 0.43];
 
 /// An extinction per world length through which nothing passes.
 const OPAQUE: f32 = 1e30;
@@ -300,16 +310,23 @@ impl<'s> PathTracer<'s> {
             let mut light = Vec3::ZERO;
             let from =
                 Scattering { at: origin, before, phase: medium.phase, worth: carried.worth().max_element() };
+            let (after, _) = medium.phase.sample(before, [random.unit(), random.unit()]);
+            let may_go_on = self.settings.max_scatterings.is_none_or(|most| scatterings < most);
+            let mut later = Vec3::ZERO;
             for (source, shade) in lights.iter().zip(&self.shades) {
-                light += self.arriving(worker, source, shade.as_ref(), &from, &mut random);
+                let shaded = shade.as_ref().map(|shade| shade.at(origin));
+                light += self.arriving(worker, source, shaded, &from, &mut random);
+                if let (true, Light::Sun(sun), Some(shaded)) = (may_go_on, source, shaded) {
+                    later += Vec3::from_array(sun.irradiance) * expected_later(sun, shaded, &from, after);
+                }
             }
             if let Some(map) = sky_map {
                 light += self.mapped(worker, map, origin, before, medium.phase, &mut random);
             }
             let light = carried.worth() * light;
             *(if scatterings == 1 { &mut sample.direct } else { &mut sample.indirect }) += light;
-            let (direction, _) = medium.phase.sample(before, [random.unit(), random.unit()]);
-            ray = Ray { origin, direction: direction.as_dvec3().normalize() };
+            sample.indirect -= carried.worth() * later;
+            ray = Ray { origin, direction: after.as_dvec3().normalize() };
         }
         sample
     }
@@ -319,7 +336,7 @@ impl<'s> PathTracer<'s> {
         &self,
         worker: &mut PathWorker<'s>,
         light: &Light,
-        shade: Option<&Shade>,
+        shade: Option<Shaded>,
         from: &Scattering,
         random: &mut Random,
     ) -> Vec3 {
@@ -451,12 +468,13 @@ impl<'s> PathTracer<'s> {
         worker: &mut PathWorker<'s>,
         ray: &Ray,
         limit: f64,
-        shade: Option<&Shade>,
+        shade: Option<Shaded>,
         worth: f32,
         random: &mut Random,
     ) -> Vec3 {
-        let Some(shade) = shade else { return self.transmittance(worker, ray, limit, random) };
-        let Shaded { passes, varies } = shade.at(ray.origin);
+        let Some(Shaded { passes, varies }) = shade else {
+            return self.transmittance(worker, ray, limit, random);
+        };
         let chance = worth * (SHADE_EDGES * varies + SHADE_HALVES * passes * (1.0 - passes));
         let chance = chance.clamp(LEAST_SHADOW_RAYS, 1.0);
         let mut light = passes;
@@ -606,6 +624,28 @@ fn pass<'s, const COLOURS: usize>(
         }
     }
     passes(&ratio, known)
+}
+
+/// By how much more of a sun's irradiance than the mean over all directions the next collisions are expected to scatter, if a path
+/// goes on in the direction `after`. The mean over the phase function is exactly 0, whatever is expected: taken off from what a
+/// path brings it leaves the mean as it is, and much less noise where scattering is forward.
+///
+/// As if as much light got to the next collisions as gets to this one, and part of the paths left before: deep in the shade nothing
+/// comes, and in full light there is little medium. Lobes that follow each other are a lobe of the product of their asymmetries.
+fn expected_later(sun: &Sun, shaded: Shaded, from: &Scattering, after: Vec3) -> f32 {
+    let Phase::HenyeyGreenstein { g } = from.phase else { return 0.0 };
+    let g = g.clamp(-MAX_ASYMMETRY, MAX_ASYMMETRY);
+    let scale = shaded.passes * (1.0 - shaded.passes);
+    if g == 0.0 || scale <= 0.0 {
+        return 0.0;
+    }
+    let lobe = |g: f32, direction: Vec3| Phase::HenyeyGreenstein { g }.between(direction, sun.direction_to);
+    let (mut sum, mut power) = (0.0, g);
+    for part in LATER_LOBES {
+        sum += part * (lobe(power, after) - lobe(power * g, from.before));
+        power *= g;
+    }
+    scale * sum
 }
 
 /// The shade of a light, if it is a sun and all media are grey.

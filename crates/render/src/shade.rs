@@ -131,6 +131,7 @@ impl Shade {
 }
 
 /// What a [`Shade`] says of a place.
+#[derive(Debug, Clone, Copy)]
 pub(crate) struct Shaded {
     /// The share of the sun's light that gets there.
     pub(crate) passes: f32,
