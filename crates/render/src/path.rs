@@ -767,3 +767,34 @@ impl<'r, 't, 's> Front<'r, 't, 's> {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_expected_later_has_a_mean_of_nothing() {
+        let sun = Sun::point(Vec3::new(0.6, 0.64, 0.48), [1.0; 3]);
+        let shaded = Shaded { passes: 0.4, varies: 0.1 };
+        let before = Vec3::new(0.0, 0.8, 0.6);
+        for g in [-0.7, 0.2, 0.8] {
+            let phase = Phase::HenyeyGreenstein { g };
+            let from = Scattering { at: DVec3::ZERO, before, phase, worth: 1.0 };
+            let mut random = Random { path: 7, count: 0 };
+            let expected = |random: &mut Random| {
+                let (after, _) = phase.sample(before, [random.unit(), random.unit()]);
+                f64::from(expected_later(&sun, shaded, &from, after))
+            };
+            let all: Vec<f64> = (0..200_000).map(|_| expected(&mut random)).collect();
+            let mean = all.iter().sum::<f64>() / all.len() as f64;
+            let variance = all.iter().map(|value| (value - mean).powi(2)).sum::<f64>() / all.len() as f64;
+            let error = (variance / all.len() as f64).sqrt();
+            assert!(
+                mean.abs() < 4.0 * error && variance > 0.0,
+                "{g}: {mean} with a standard error of {error}"
+            );
+        }
+        let from = Scattering { at: DVec3::ZERO, before, phase: Phase::mie(10.0), worth: 1.0 };
+        assert_eq!(expected_later(&sun, shaded, &from, Vec3::Y), 0.0);
+    }
+}

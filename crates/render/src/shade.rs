@@ -161,3 +161,38 @@ impl<'s> Caster<'_, 's> {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::math::exp;
+    use crate::scene::Shape;
+    use glam::DAffine3;
+
+    /// A block of extinction 2, four high, lit from above: the shade falls off as it should, and is the same on the way in.
+    #[test]
+    fn a_block_dims_the_light_as_it_should() {
+        let world_from_unit = DAffine3::from_scale(DVec3::new(3.0, 4.0, 5.0));
+        let block = Solid::new(Shape::Box { world_from_unit }).expect("a block");
+        let shade = Shade::new(&[Caster::Solid(&block, 2.0)], Vec3::Y).expect("a lattice");
+        for depth in [0.1, 0.5, 1.0, 2.5, 3.9] {
+            let shaded = shade.at(DVec3::new(1.3, 4.0 - depth, 2.2));
+            let expected = exp(-2.0 * depth as f32);
+            assert!((shaded.passes - expected).abs() < 0.003, "{depth}: {} of {expected}", shaded.passes);
+            assert!(
+                shaded.varies < 0.12 && (depth > 1.0 || shaded.varies > 0.01),
+                "{depth}: {}",
+                shaded.varies
+            );
+        }
+        assert!(shade.at(DVec3::new(1.0, 9.0, 1.0)).passes > 0.99);
+    }
+
+    #[test]
+    fn what_has_no_extent_has_no_shade() {
+        assert!(Shade::new(&[], Vec3::Y).is_none());
+        let world_from_unit = DAffine3::from_scale(DVec3::splat(f64::MAX));
+        let huge = Solid::new(Shape::Ball { world_from_unit });
+        assert!(huge.is_none_or(|huge| Shade::new(&[Caster::Solid(&huge, 1.0)], Vec3::Y).is_none()));
+    }
+}
