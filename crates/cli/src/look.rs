@@ -176,7 +176,7 @@ pub(crate) struct Look {
     #[arg(long, default_value = "0", value_name = "N", help_heading = "Quality")]
     pub(crate) seed: u32,
 
-    /// With --integrator path, see the sky only by paths that leave the volumes, not by rays of their own
+    /// With --integrator path, see a sky that is a picture only by paths that leave the volumes, not by rays of its own
     #[arg(long, help_heading = "Quality")]
     pub(crate) no_sky_rays: bool,
 }

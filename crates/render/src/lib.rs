@@ -34,6 +34,7 @@ pub mod picture;
 pub mod progressive;
 pub mod sampler;
 pub mod scene;
+mod shade;
 mod simd;
 mod solid;
 pub mod surface;

@@ -10,11 +10,17 @@
 //! et al., "Hero Wavelength Spectral Sampling", 2014; Miller et al., "A null-scattering path integral formulation of light
 //! transport", 2019); no weight can exceed 3.
 //!
-//! At each collision the light of each light and of the sky is taken with a transmittance by residual ratio tracking (Novák
-//! et al., "Residual Ratio Tracking for Estimating Attenuation in Participating Media", 2014). Of a light with extent, a
-//! direction is taken evenly from what is seen of it, or, where the phase function is narrower than the light, from either
-//! with even chances, weighed by the balance heuristic; of a sky that is a picture always from either (Veach, "Robust Monte Carlo Methods for Light Transport Simulation",
-//! 1997). Paths end by Russian roulette.
+//! At each collision the light of each light, and of a sky that is a picture, is taken with a transmittance by residual ratio
+//! tracking (Novák et al., "Residual Ratio Tracking for Estimating Attenuation in Participating Media", 2014). Of a light with
+//! extent, a direction is taken evenly from what is seen of it, or, where the phase function is narrower than the light, from
+//! either with even chances, weighed by the balance heuristic; of a sky that is a picture always from either (Veach, "Robust
+//! Monte Carlo Methods for Light Transport Simulation", 1997). Other skies are seen by paths that leave the media: with most of
+//! their weight left, whatever way they went, which is quieter than a sum over collisions. Paths end by Russian roulette.
+//!
+//! Two control variates make suns cheap and quiet where all media are grey. Most collisions take the sun's transmittance from
+//! a lattice ([`crate::shade`]), and the few that follow a ray, an exact one, count with what they find beside it for the
+//! others. And of what a direction of scattering makes more likely to be found by the next collisions, the expected part is
+//! taken off, whose mean is 0 ([`expected_later`]).
 //!
 //! What does not live here: pixels, threads, pictures ([`crate::picture`]).
 
@@ -23,12 +29,17 @@ use nuage_volume::accessor::Accessor;
 
 use crate::blocks::Blocks;
 use crate::camera::Ray;
+use crate::depth::optical_depth;
 use crate::envmap::EnvironmentMap;
+use crate::filter::Filter;
 use crate::hash::{hash_u32, unit_f32};
-use crate::light::{Arriving, Light, Sky};
+use crate::light::{Arriving, Light, Sky, Sun};
 use crate::math::{exp, ln};
+use crate::phase::MAX_ASYMMETRY;
 use crate::scene::{Phase, Scene, Shape, Spectrum, Volume};
+use crate::shade::{Caster, Shade, Shaded};
 use crate::solid::Solid;
+use crate::track::first_collision;
 use crate::traverse::{Field, LocalRay, Reader, Runs, Segment};
 
 /// How paths are made.
@@ -36,8 +47,8 @@ use crate::traverse::{Field, LocalRay, Reader, Runs, Segment};
 pub struct PathSettings {
     /// How often light may scatter before it reaches the camera; as often as it does if `None`.
     pub max_scatterings: Option<u32>,
-    /// Whether each collision looks for the sky with a ray of its own. Else only paths that leave the medium see it. The
-    /// other lights can be seen in no other way.
+    /// Whether each collision looks with a ray of its own for a sky that is a picture. Else only paths that leave the medium
+    /// see it, as they do skies of other kinds. The other lights can be seen in no other way.
     pub sky_rays: bool,
 }
 
@@ -53,6 +64,18 @@ const ROULETTE_WEIGHT: f32 = 0.25;
 /// A shadow ray through which less passes goes on with a chance of that over it.
 const ROULETTE_TRANSMITTANCE: f32 = 0.1;
 
+/// Of collisions that are in the shade of a sun, so many follow a shadow ray at least. What one finds that the shade did not
+/// know of counts for as many as there are to each of them, so fewer would make bright specks.
+const LEAST_SHADOW_RAYS: f32 = 0.04;
+
+/// How much more follow one where the shade is uncertain, for a path of weight 1 and a phase function of 1: where it changes
+/// from node to node, and where half of the light passes. Fewer save little time, for by far the most of it goes to collisions.
+const SHADE_EDGES: f32 = 4.0;
+const SHADE_HALVES: f32 = 0.5;
+
+/// Of the light of a sun that scatters once more and then again and again, what counts in [`expected_later`]: by trial.
+const LATER_LOBES: [f32; 3] = [1.2, 0.72, 0.43];
+
 /// An extinction per world length through which nothing passes.
 const OPAQUE: f32 = 1e30;
 
@@ -62,6 +85,8 @@ pub struct PathTracer<'s> {
     settings: PathSettings,
     media: Vec<Medium<'s>>,
     glows: Vec<Glow<'s>>,
+    /// Of each light that is a sun, if all media are grey.
+    shades: Vec<Option<Shade>>,
 }
 
 /// A volume made ready for paths.
@@ -168,6 +193,16 @@ struct Collision<'t, 's> {
     medium: &'t Medium<'s>,
 }
 
+/// Where light is scattered.
+struct Scattering {
+    at: DVec3,
+    /// The direction before.
+    before: Vec3,
+    phase: Phase,
+    /// What the path is worth there.
+    worth: f32,
+}
+
 /// What a path is worth on its way.
 struct Carried {
     /// What light is multiplied by.
@@ -214,9 +249,10 @@ impl<'s> PathTracer<'s> {
             let region = Region::new(emission.channel.map_or(volume.shape, Shape::Grid))?;
             Some(Glow { region, spectrum: &emission.spectrum })
         };
-        let media = scene.volumes.iter().filter_map(medium).collect();
+        let media: Vec<_> = scene.volumes.iter().filter_map(medium).collect();
         let glows = scene.volumes.iter().filter_map(glow).collect();
-        PathTracer { scene, settings, media, glows }
+        let shades = scene.lights.iter().map(|light| shade(light, &media)).collect();
+        PathTracer { scene, settings, media, glows, shades }
     }
 
     /// What a thread needs.
@@ -230,7 +266,11 @@ impl<'s> PathTracer<'s> {
     /// What one path says of the light along a ray.
     pub fn sample(&self, worker: &mut PathWorker<'s>, ray: &Ray, seed: u32) -> PathSample {
         let Scene { lights, sky, .. } = self.scene;
-        let sky_is_black = sky.is_black();
+        // A sky without sharp lights is best met by chance: a path that leaves the medium sees it with its whole weight.
+        let sky_map = match sky {
+            Sky::Map(map) if self.settings.sky_rays && !map.is_black() => Some(map.as_ref()),
+            _ => None,
+        };
         let mut random = Random { path: seed, count: 0 };
         let mut carried = Carried { weight: Vec3::ONE, colours: Vec3::ONE };
         let mut sample = PathSample::default();
@@ -242,7 +282,7 @@ impl<'s> PathTracer<'s> {
             let Some(Collision { distance, medium }) = collision else {
                 match scatterings {
                     0 => sample.passed = true,
-                    _ if self.settings.sky_rays => {}
+                    _ if sky_map.is_some() => {}
                     _ => {
                         let light = carried.worth() * sky.radiance(ray.direction.as_vec3());
                         *(if scatterings == 1 { &mut sample.direct } else { &mut sample.indirect }) += light;
@@ -268,26 +308,25 @@ impl<'s> PathTracer<'s> {
             let origin = ray.origin + ray.direction * distance;
             let before = ray.direction.as_vec3();
             let mut light = Vec3::ZERO;
-            for source in lights {
-                light += self.arriving(worker, source, origin, before, medium.phase, &mut random);
+            let from =
+                Scattering { at: origin, before, phase: medium.phase, worth: carried.worth().max_element() };
+            let (after, _) = medium.phase.sample(before, [random.unit(), random.unit()]);
+            let may_go_on = self.settings.max_scatterings.is_none_or(|most| scatterings < most);
+            let mut later = Vec3::ZERO;
+            for (source, shade) in lights.iter().zip(&self.shades) {
+                let shaded = shade.as_ref().map(|shade| shade.at(origin));
+                light += self.arriving(worker, source, shaded, &from, &mut random);
+                if let (true, Light::Sun(sun), Some(shaded)) = (may_go_on, source, shaded) {
+                    later += Vec3::from_array(sun.irradiance) * expected_later(sun, shaded, &from, after);
+                }
             }
-            let scattered = |random: &mut Random| {
-                let (direction, _) = medium.phase.sample(before, [random.unit(), random.unit()]);
-                Ray { origin, direction: direction.as_dvec3().normalize() }
-            };
-            if self.settings.sky_rays && !sky_is_black {
-                light += match sky {
-                    Sky::Map(map) => self.mapped(worker, map, origin, before, medium.phase, &mut random),
-                    Sky::Constant(_) | Sky::Gradient { .. } => {
-                        let towards = scattered(&mut random);
-                        let radiance = sky.radiance(towards.direction.as_vec3());
-                        radiance * self.transmittance(worker, &towards, f64::INFINITY, &mut random)
-                    }
-                };
+            if let Some(map) = sky_map {
+                light += self.mapped(worker, map, origin, before, medium.phase, &mut random);
             }
             let light = carried.worth() * light;
             *(if scatterings == 1 { &mut sample.direct } else { &mut sample.indirect }) += light;
-            ray = scattered(&mut random);
+            sample.indirect -= carried.worth() * later;
+            ray = Ray { origin, direction: after.as_dvec3().normalize() };
         }
         sample
     }
@@ -297,17 +336,19 @@ impl<'s> PathTracer<'s> {
         &self,
         worker: &mut PathWorker<'s>,
         light: &Light,
-        at: DVec3,
-        before: Vec3,
-        phase: Phase,
+        shade: Option<Shaded>,
+        from: &Scattering,
         random: &mut Random,
     ) -> Vec3 {
+        let Scattering { at, before, phase, .. } = *from;
         match light.arriving(at) {
             Arriving::Nothing => Vec3::ZERO,
             Arriving::Ray { direction, distance, irradiance } => {
                 let scatters = phase.between(before, direction.as_vec3());
                 let towards = Ray { origin: at, direction };
-                irradiance * (scatters * self.transmittance(worker, &towards, distance, random))
+                irradiance
+                    * (scatters
+                        * self.passes(worker, &towards, distance, shade, scatters * from.worth, random))
             }
             Arriving::Cone { cone, radiance } => {
                 let solid_angle = cone.solid_angle();
@@ -326,7 +367,9 @@ impl<'s> PathTracer<'s> {
                 let direction = direction.as_dvec3().normalize();
                 let towards = Ray { origin: at, direction };
                 let distance = light.distance(at, direction);
-                radiance * (scatters / density * self.transmittance(worker, &towards, distance, random))
+                radiance
+                    * (scatters / density
+                        * self.passes(worker, &towards, distance, shade, scatters * from.worth, random))
             }
         }
     }
@@ -369,7 +412,7 @@ impl<'s> PathTracer<'s> {
         let PathWorker { media, glows } = worker;
         let (collision, told) = match (self.media.as_slice(), media.as_mut_slice()) {
             ([medium @ Medium { region: Region::Field(field), is_grey: true, .. }], [Some(reader)]) => {
-                let distance = fly_alone(field, reader, medium.scale, ray, random);
+                let distance = first_collision(field, reader, ray, medium.scale, || random.unit());
                 (distance.map(|distance| Collision { distance, medium }), 0.0)
             }
             _ => self.fly_among(media, glows, ray, carried, emitted, random),
@@ -416,6 +459,46 @@ impl<'s> PathTracer<'s> {
             }
             front.advance(carried.colours, random);
         }
+    }
+
+    /// The same as [`transmittance`](Self::transmittance), for a light of which a path of `worth` wants to know: where the
+    /// shade of a sun is known, shadow rays are followed the more seldom the less they can change.
+    fn passes(
+        &self,
+        worker: &mut PathWorker<'s>,
+        ray: &Ray,
+        limit: f64,
+        shade: Option<Shaded>,
+        worth: f32,
+        random: &mut Random,
+    ) -> Vec3 {
+        let Some(Shaded { passes, varies }) = shade else {
+            return self.transmittance(worker, ray, limit, random);
+        };
+        let chance = worth * (SHADE_EDGES * varies + SHADE_HALVES * passes * (1.0 - passes));
+        let chance = chance.clamp(LEAST_SHADOW_RAYS, 1.0);
+        let mut light = passes;
+        // What a shadow ray finds beside it has to count for all those that are not followed.
+        if random.unit() < chance {
+            light += (self.exact_transmittance(worker, ray) - passes) / chance;
+        }
+        Vec3::splat(light)
+    }
+
+    /// The share of light that passes along a ray to its end, where all media are grey.
+    fn exact_transmittance(&self, worker: &mut PathWorker<'s>, ray: &Ray) -> f32 {
+        let media = self.media.iter().zip(&mut worker.media);
+        let depth = media.map(|(medium, reader)| match (&medium.region, reader) {
+            (Region::Field(field), Some(reader)) => {
+                medium.scale * optical_depth(field, reader, ray, Filter::Trilinear)
+            }
+            (Region::Solid(solid), _) => {
+                let length = solid.interval(ray).map_or(0.0, |[start, end]| end - start);
+                medium.scale * length as f32
+            }
+            (Region::Field(_), None) => 0.0,
+        });
+        exp(-depth.sum::<f32>())
     }
 
     /// A vector whose mean is the share of light that passes along a ray up to a distance.
@@ -486,40 +569,6 @@ impl<'s> PathTracer<'s> {
     }
 }
 
-/// The distance at which a ray collides in the one grey medium that there is.
-fn fly_alone<'s>(
-    field: &Field<'s>,
-    reader: &mut Reader<'s>,
-    scale: f32,
-    ray: &Ray,
-    random: &mut Random,
-) -> Option<f64> {
-    let Reader { walker, blocks, .. } = reader;
-    let [start, end] = field.interval(ray)?;
-    let local = field.local(ray, start);
-    let mut segments = field.runs(walker, local, 0.0, (end - start) as f32);
-    let mut depth = random.depth();
-    while let Some(segment) = segments.next_segment() {
-        let majorant = segment.max * scale;
-        let mut t = segment.t0;
-        loop {
-            let left = (segment.t1 - t) * majorant;
-            if depth >= left {
-                depth -= left;
-                break;
-            }
-            t += depth / majorant;
-            let is_real =
-                segment.min == segment.max || random.unit() * segment.max < field.sample(blocks, local.at(t));
-            if is_real {
-                return Some(start + f64::from(t));
-            }
-            depth = random.depth();
-        }
-    }
-    None
-}
-
 /// A number whose mean is the share of light that passes along a ray through a field up to a distance, for each of some
 /// colours, whose extinctions are `shares` of `scale`. By residual ratio tracking: what the least extinction of a segment
 /// takes away is known, only the rest is left to chance.
@@ -575,6 +624,41 @@ fn pass<'s, const COLOURS: usize>(
         }
     }
     passes(&ratio, known)
+}
+
+/// By how much more of a sun's irradiance than the mean over all directions the next collisions are expected to scatter, if a path
+/// goes on in the direction `after`. The mean over the phase function is exactly 0, whatever is expected: taken off from what a
+/// path brings it leaves the mean as it is, and much less noise where scattering is forward.
+///
+/// As if as much light got to the next collisions as gets to this one, and part of the paths left before: deep in the shade nothing
+/// comes, and in full light there is little medium. Lobes that follow each other are a lobe of the product of their asymmetries.
+fn expected_later(sun: &Sun, shaded: Shaded, from: &Scattering, after: Vec3) -> f32 {
+    let Phase::HenyeyGreenstein { g } = from.phase else { return 0.0 };
+    let g = g.clamp(-MAX_ASYMMETRY, MAX_ASYMMETRY);
+    let scale = shaded.passes * (1.0 - shaded.passes);
+    if g == 0.0 || scale <= 0.0 {
+        return 0.0;
+    }
+    let lobe = |g: f32, direction: Vec3| Phase::HenyeyGreenstein { g }.between(direction, sun.direction_to);
+    let (mut sum, mut power) = (0.0, g);
+    for part in LATER_LOBES {
+        sum += part * (lobe(power, after) - lobe(power * g, from.before));
+        power *= g;
+    }
+    scale * sum
+}
+
+/// The shade of a light, if it is a sun and all media are grey.
+fn shade(light: &Light, media: &[Medium<'_>]) -> Option<Shade> {
+    let Light::Sun(sun) = light else { return None };
+    if !media.iter().all(|medium| medium.is_grey) {
+        return None;
+    }
+    let casters = media.iter().map(|medium| match &medium.region {
+        Region::Field(field) => Caster::Field(field, medium.scale),
+        Region::Solid(solid) => Caster::Solid(solid, medium.scale),
+    });
+    Shade::new(&casters.collect::<Vec<_>>(), sun.direction_to)
 }
 
 /// The next tentative collision of a ray with one medium.
@@ -681,5 +765,36 @@ impl<'r, 't, 's> Front<'r, 't, 's> {
                 (field.sample(blocks, local.at(*t)) / segment.max).min(1.0)
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_expected_later_has_a_mean_of_nothing() {
+        let sun = Sun::point(Vec3::new(0.6, 0.64, 0.48), [1.0; 3]);
+        let shaded = Shaded { passes: 0.4, varies: 0.1 };
+        let before = Vec3::new(0.0, 0.8, 0.6);
+        for g in [-0.7, 0.2, 0.8] {
+            let phase = Phase::HenyeyGreenstein { g };
+            let from = Scattering { at: DVec3::ZERO, before, phase, worth: 1.0 };
+            let mut random = Random { path: 7, count: 0 };
+            let expected = |random: &mut Random| {
+                let (after, _) = phase.sample(before, [random.unit(), random.unit()]);
+                f64::from(expected_later(&sun, shaded, &from, after))
+            };
+            let all: Vec<f64> = (0..200_000).map(|_| expected(&mut random)).collect();
+            let mean = all.iter().sum::<f64>() / all.len() as f64;
+            let variance = all.iter().map(|value| (value - mean).powi(2)).sum::<f64>() / all.len() as f64;
+            let error = (variance / all.len() as f64).sqrt();
+            assert!(
+                mean.abs() < 4.0 * error && variance > 0.0,
+                "{g}: {mean} with a standard error of {error}"
+            );
+        }
+        let from = Scattering { at: DVec3::ZERO, before, phase: Phase::mie(10.0), worth: 1.0 };
+        assert_eq!(expected_later(&sun, shaded, &from, Vec3::Y), 0.0);
     }
 }

@@ -25,6 +25,16 @@ impl Solid {
             .then_some(Solid { unit_from_world, is_ball })
     }
 
+    /// The corners, in the world, of a box around it.
+    pub(crate) fn world_corners(&self) -> [DVec3; 8] {
+        let world_from_unit = self.unit_from_world.inverse();
+        let low = if self.is_ball { -1.0 } else { 0.0 };
+        std::array::from_fn(|i| {
+            let corner = [i >> 2, i >> 1 & 1, i & 1].map(|high| if high == 1 { 1.0 } else { low });
+            world_from_unit.transform_point3(DVec3::from_array(corner))
+        })
+    }
+
     /// Where a ray enters and leaves, as distances from its origin.
     pub(crate) fn interval(&self, ray: &Ray) -> Option<[f64; 2]> {
         let origin = self.unit_from_world.transform_point3(ray.origin);

@@ -245,6 +245,17 @@ impl<'a> Field<'a> {
         blocks.trilinear_in_cell(cell.wrapping_add(self.base_brick << 3), fraction)
     }
 
+    /// The value at a place in the world, read without decoding a brick.
+    pub(crate) fn value_at(&self, reader: &mut Accessor<'a>, p_world: DVec3) -> f32 {
+        let position = self.index_from_world * p_world + self.offset;
+        if position.cmplt(self.bounds[0]).any() || !position.cmple(self.bounds[1]).all() {
+            return 0.0;
+        }
+        let cell = position.floor();
+        let index = cell.as_ivec3().wrapping_add(self.base_brick << 3);
+        reader.trilinear_in_cell(index, (position - cell).as_vec3())
+    }
+
     /// The runs of a ray between `t0` and `t1`, both inside the field.
     pub fn runs<'r>(&self, accessor: &'r mut Accessor<'a>, ray: LocalRay, t0: f32, t1: f32) -> Runs<'r, 'a> {
         let position = (ray.origin + ray.direction * t0) * 0.125;
