@@ -123,11 +123,13 @@ impl<'a> Measure<'a> {
 
     /// The codecs to be tried unless one is asked for, the cheapest first. The last can hold any brick.
     pub fn codecs(&self) -> impl Iterator<Item = Codec> + use<> {
-        let sparse = match (&self.seen, &self.sparse) {
-            (Some(seen), _) => seen.codecs(),
-            (None, Some(sparse)) => sparse.codecs(self.values, self.scale),
-            (None, None) => Vec::new(),
-        };
+        let mut sparse =
+            self.sparse.as_ref().map_or(Vec::new(), |sparse| sparse.codecs(self.values, self.scale));
+        if let Some(seen) = &self.seen {
+            sparse.retain(|codec| matches!(codec, Codec::Sparse { is_fitted: true, .. }));
+            sparse.extend(seen.codecs());
+            sparse.sort_by_key(|codec| codec.word_count());
+        }
         // Where much is empty, codes for all voxels do not pay.
         let is_tried = match self.sparse.as_ref().is_some_and(Sparse::is_mostly_empty) {
             true => |codec: &Codec| !has_codes(*codec),
@@ -147,12 +149,17 @@ impl<'a> Measure<'a> {
         if self.seen.is_none() {
             return self.plain_error(codec);
         }
-        if let (Some(seen), Codec::Sparse { pairs, .. }) = (&self.seen, codec) {
+        if let (Some(seen), Codec::Sparse { is_fitted: false, pairs }) = (&self.seen, codec) {
             return seen.sparse_error(pairs);
         }
         let error = self.plain_error(codec)?;
-        let seen = self.seen.as_ref()?.of_values(&self.decoded(codec)?);
-        Some(Error { bias: seen - error.squared, ..error })
+        let (seen, decoded) = (self.seen.as_ref()?, self.decoded(codec)?);
+        // What rounding leaves over is like noise; what is left out and what is but predicted is not.
+        let weighed = match has_codes(codec) || error.max == 0.0 {
+            true => seen.of_noise(&decoded),
+            false => seen.of_values(&decoded),
+        };
+        Some(Error { bias: weighed - error.squared, ..error })
     }
 
     /// The values that a codec leads to.

@@ -350,7 +350,7 @@ fn encode_level(level: &Level, choice: &Choice, curves: Option<&[Curve]>) -> (En
         };
         let mut words = Vec::with_capacity(best.codec.word_count());
         match (best.codec, light_in(i)) {
-            (Codec::Sparse { pairs, .. }, Some(light)) => {
+            (Codec::Sparse { is_fitted: false, pairs }, Some(light)) => {
                 Seen::of(brick, &choice.scale, light).write(pairs, &mut words);
             }
             (codec, _) => write(brick, codec, &choice.scale, &choice.shapes, &mut words),
