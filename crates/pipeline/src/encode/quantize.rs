@@ -148,8 +148,13 @@ impl<'a> Measure<'a> {
             return seen.sparse_error(pairs);
         }
         let error = self.plain_error(codec)?;
-        let seen = self.seen.as_ref()?.of_values(&self.decoded(codec)?);
-        Some(Error { bias: seen - error.squared, ..error })
+        let (seen, decoded) = (self.seen.as_ref()?, self.decoded(codec)?);
+        // What rounding leaves over is like noise; what is left out and what is but predicted is not.
+        let weighed = match has_codes(codec) || error.max == 0.0 {
+            true => seen.of_noise(&decoded),
+            false => seen.of_values(&decoded),
+        };
+        Some(Error { bias: weighed - error.squared, ..error })
     }
 
     /// The values that a codec leads to.
@@ -207,6 +212,17 @@ impl<'a> Measure<'a> {
             Codec::F32 => Some(Error::default()),
             Codec::Shared => best_shared(values, scale, shapes).map(|(error, _)| error),
         }
+    }
+}
+
+/// Whether a codec has codes of two bits or more for all voxels.
+fn has_codes(codec: Codec) -> bool {
+    match codec {
+        Codec::Uniform { bits }
+        | Codec::Gradient { bits }
+        | Codec::Lattice { bits }
+        | Codec::Split { bits } => bits > 1,
+        _ => false,
     }
 }
 

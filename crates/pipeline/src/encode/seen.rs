@@ -8,10 +8,11 @@
 
 use std::sync::LazyLock;
 
+use fearless_simd::{Simd, dispatch};
 use nuage_volume::codec::{Codec, sparse};
 use nuage_volume::space::BRICK_VOXELS;
 
-use super::quantize::{Brick, ChannelScale, Error, StoredLine};
+use super::quantize::{Brick, ChannelScale, Error, SIMD, StoredLine};
 
 /// How much light gets to each block of 2³ voxels of a brick, block `x << 4 | y << 2 | z`, as an amplitude up to 1.
 pub type Light = [f32; 64];
@@ -64,6 +65,7 @@ impl Field {
     const ROWS: usize = 8 + 2 * REACH;
     const ROW: usize = 16;
 
+    #[inline(always)]
     fn of(errors: &Brick) -> Box<Field> {
         let mut field = Box::new(Field([0.0; Field::ROWS * Field::ROWS * Field::ROW]));
         for (voxel, error) in errors.iter().enumerate().filter(|(_, error)| **error != 0.0) {
@@ -73,11 +75,14 @@ impl Field {
     }
 
     /// Adds an error.
+    #[inline(always)]
     fn add(&mut self, voxel: usize, error: f32) {
         let begin = Field::index(voxel, 0);
-        for (row, weights) in ROWS.iter().enumerate() {
+        let rows = &*ROWS;
+        for (row, weights) in rows.iter().enumerate() {
             let at = begin + (row / AROUND * Field::ROWS + row % AROUND) * Field::ROW;
-            self.0[at..at + 8].iter_mut().zip(weights).for_each(|(sum, weight)| *sum += error * weight);
+            let Some(sums) = self.0[at..].first_chunk_mut::<8>() else { return };
+            (0..8).for_each(|z| sums[z] += error * weights[z]);
         }
     }
 
@@ -187,8 +192,20 @@ impl<'a> Seen<'a> {
 
     /// What is seen of the error of given values.
     pub fn of_values(&self, given: &Brick) -> f64 {
-        let errors = std::array::from_fn(|i| (given[i] - self.values[i]) * self.amplitude[i]);
-        Field::of(&errors).seen(&errors)
+        let errors = self.errors(given);
+        dispatch!(*SIMD, simd => simd.vectorize(
+            #[inline(always)]
+            || Field::of(&errors).seen(&errors)
+        ))
+    }
+
+    /// What is seen of errors like noise, which do not hang together: the sum of their squares.
+    pub fn of_noise(&self, given: &Brick) -> f64 {
+        self.errors(given).iter().map(|error| f64::from(*error).powi(2)).sum()
+    }
+
+    fn errors(&self, given: &Brick) -> Brick {
+        std::array::from_fn(|i| (given[i] - self.values[i]) * self.amplitude[i])
     }
 
     /// The best of the ways that take so many words.
@@ -201,6 +218,14 @@ impl<'a> Seen<'a> {
 
     /// Finds the codes.
     fn code(&self, way: &Way, shortened: f32) -> Coded {
+        dispatch!(*SIMD, simd => simd.vectorize(
+            #[inline(always)]
+            || self.code_on(way, shortened)
+        ))
+    }
+
+    #[inline(always)]
+    fn code_on(&self, way: &Way, shortened: f32) -> Coded {
         let Way { bits, above, .. } = *way;
         let (values, floor) = (self.values, self.scale.floor);
         let holds = |voxel: usize| values[voxel].abs() > above;
@@ -248,7 +273,8 @@ impl<'a> Seen<'a> {
             symbol => levels[usize::from(symbol) - 1],
         });
         let plain = self.plain_error(&given);
-        Coded { line, bits, symbols, error: Error { bias: self.of_values(&given) - plain.squared, ..plain } }
+        let bias = field.seen(&errors) - plain.squared;
+        Coded { line, bits, symbols, error: Error { bias, ..plain } }
     }
 
     /// The error of values without regard to what is seen of it.
