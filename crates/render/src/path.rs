@@ -18,9 +18,9 @@
 //! their weight left, whatever way they went, which is quieter than a sum over collisions. Paths end by Russian roulette.
 //!
 //! Two control variates make suns cheap and quiet where all media are grey. Most collisions take the sun's transmittance from
-//! a lattice ([`crate::shade`]), and the few that follow a ray, an exact one, count with what they find beside it for the
+//! a lattice (`shade`), and the few that follow a ray, an exact one, count with what they find beside it for the
 //! others. And of what a direction of scattering makes more likely to be found by the next collisions, the expected part is
-//! taken off, whose mean is 0 ([`expected_later`]).
+//! taken off, whose mean is 0 (`expected_later`).
 //!
 //! What does not live here: pixels, threads, pictures ([`crate::picture`]).
 

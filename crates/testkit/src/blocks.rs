@@ -63,13 +63,18 @@ mod tests {
     use super::*;
     use std::panic::catch_unwind;
 
-    /// A picture of 64² pixels, each off by as much as its standard error says.
-    fn picture(seed: u32, bias: impl Fn(usize) -> f64) -> Vec<Estimate> {
+    const WIDTH: usize = 128;
+
+    /// A square picture, each pixel off by as much as its standard error says.
+    fn picture(seed: u64, bias: impl Fn(usize) -> f64) -> Vec<Estimate> {
         let noise = |i: usize| {
-            let x = (i as u32 ^ seed.wrapping_mul(0x9e37_79b9)).wrapping_mul(2_654_435_761);
-            f64::from((x ^ x >> 15).wrapping_mul(2_246_822_519) >> 8) / f64::from(1 << 24) - 0.5
+            // SplitMix64.
+            let x = (seed << 32 | i as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+            let x = (x ^ x >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+            let x = (x ^ x >> 27).wrapping_mul(0x94d0_49bb_1331_11eb);
+            (x >> 40) as f64 / (1_u64 << 24) as f64 - 0.5
         };
-        (0..64 * 64)
+        (0..WIDTH * WIDTH)
             .map(|i| Estimate { mean: 1.0 + 0.1 * noise(i) + bias(i), variance: 0.01 / 12.0 })
             .collect()
     }
@@ -77,12 +82,12 @@ mod tests {
     #[test]
     fn noise_passes_and_bias_does_not() {
         let reference = picture(1, |_| 0.0);
-        hold("noise", 64, &picture(2, |_| 0.0), &reference);
+        hold("noise", WIDTH, &picture(2, |_| 0.0), &reference);
         let fails = |bias: fn(usize) -> f64| {
             let picture = picture(3, bias);
-            catch_unwind(|| hold("bias", 64, &picture, &reference)).is_err()
+            catch_unwind(|| hold("bias", WIDTH, &picture, &reference)).is_err()
         };
         assert!(fails(|_| 0.006), "all is brighter");
-        assert!(fails(|i| if i % 64 < 8 && i < 512 { 0.05 } else { 0.0 }), "a block is");
+        assert!(fails(|i| if i % WIDTH < 8 && i < 8 * WIDTH { 0.05 } else { 0.0 }), "a block is");
     }
 }

@@ -120,7 +120,7 @@ impl Part {
     #[inline(always)]
     fn push(&self, state: u32) -> u32 {
         // Rounding up adds less than 2¹¹ / 2⁶³ of the state, which is too little to reach the next whole number.
-        let quotient = (u128::from(state) * u128::from(self.inverse) >> 63) as u32;
+        let quotient = ((u128::from(state) * u128::from(self.inverse)) >> 63) as u32;
         let rest = state - quotient * self.frequency;
         quotient << SCALE_BITS | (rest + self.start)
     }
@@ -402,7 +402,7 @@ mod tests {
             let end = (u64::from(frequency) << (32 - SCALE_BITS)).min(u64::from(u32::MAX)) as u32;
             let state = (if is_multiple { state / frequency * frequency } else { state }) % end;
             let pushed = Part::new((&frequency, 0)).push(state);
-            prop_assert_eq!(pushed, (state / frequency) << SCALE_BITS | state % frequency);
+            prop_assert_eq!(pushed, ((state / frequency) << SCALE_BITS) | (state % frequency));
         }
     }
 
