@@ -121,6 +121,17 @@ struct Way {
     pairs: u8,
 }
 
+/// The codes of a brick that are nearest to its values.
+struct Nearest {
+    line: StoredLine,
+    bits: u8,
+    /// The value of each code.
+    levels: Vec<f32>,
+    symbols: sparse::Symbols,
+    /// The errors, times the light.
+    errors: Brick,
+}
+
 /// A brick in codes.
 struct Coded {
     line: StoredLine,
@@ -208,27 +219,19 @@ impl<'a> Seen<'a> {
         std::array::from_fn(|i| (given[i] - self.values[i]) * self.amplitude[i])
     }
 
-    /// The best of the ways that take so many words.
+    /// Of the ways that take so many words, and the ranges, the one whose nearest codes are the best, made better.
     fn coded(&self, pairs: u8) -> Option<Coded> {
         let ways = self.ways.iter().filter(|way| way.pairs == pairs);
-        let all = ways.flat_map(|way| SHORTENED.map(|part| self.code(way, part)));
-        let cost = |coded: &Coded| coded.error.squared + coded.error.bias;
-        all.min_by(|a, b| cost(a).total_cmp(&cost(b)))
+        let all = ways.flat_map(|way| SHORTENED.map(|part| self.nearest(way, part)));
+        let squared = |nearest: &Nearest| nearest.errors.iter().map(|error| error * error).sum::<f32>();
+        let best = all.min_by(|a, b| squared(a).total_cmp(&squared(b)))?;
+        Some(self.better(best))
     }
 
-    /// Finds the codes.
-    fn code(&self, way: &Way, shortened: f32) -> Coded {
-        dispatch!(*SIMD, simd => simd.vectorize(
-            #[inline(always)]
-            || self.code_on(way, shortened)
-        ))
-    }
-
-    #[inline(always)]
-    fn code_on(&self, way: &Way, shortened: f32) -> Coded {
+    /// The codes of the nearest values.
+    fn nearest(&self, way: &Way, shortened: f32) -> Nearest {
         let Way { bits, above, .. } = *way;
         let (values, floor) = (self.values, self.scale.floor);
-        let holds = |voxel: usize| values[voxel].abs() > above;
         let kept = values.iter().filter(|value| value.abs() > above);
         let (min, max) = kept
             .fold((f32::INFINITY, f32::NEG_INFINITY), |(min, max), value| (min.min(*value), max.max(*value)));
@@ -240,18 +243,33 @@ impl<'a> Seen<'a> {
         let levels: Vec<f32> = (0..=last).map(level).collect();
         let mut symbols = [0; BRICK_VOXELS];
         let mut errors: Brick = std::array::from_fn(|voxel| -values[voxel] * self.amplitude[voxel]);
-        for voxel in (0..BRICK_VOXELS).filter(|voxel| holds(*voxel)) {
+        for voxel in (0..BRICK_VOXELS).filter(|voxel| values[*voxel].abs() > above) {
             let above = levels.partition_point(|level| *level < values[voxel]).clamp(1, last);
             let is_nearer = levels[above] - values[voxel] < values[voxel] - levels[above - 1];
             let code = if is_nearer { above } else { above - 1 };
             symbols[voxel] = code as u8 + 1;
             errors[voxel] = (levels[code] - values[voxel]) * self.amplitude[voxel];
         }
+        Nearest { line, bits, levels, symbols, errors }
+    }
+
+    /// Steps codes up or down as long as less is seen of their errors.
+    fn better(&self, nearest: Nearest) -> Coded {
+        dispatch!(*SIMD, simd => simd.vectorize(
+            #[inline(always)]
+            || self.better_on(nearest)
+        ))
+    }
+
+    #[inline(always)]
+    fn better_on(&self, nearest: Nearest) -> Coded {
+        let Nearest { line, bits, levels, mut symbols, mut errors } = nearest;
+        let last = levels.len() - 1;
         let mut field = Field::of(&errors);
         for _ in 0..SWEEPS {
             let mut is_done = true;
-            for voxel in (0..BRICK_VOXELS).filter(|voxel| holds(*voxel)) {
-                let code = usize::from(symbols[voxel]) - 1;
+            for voxel in 0..BRICK_VOXELS {
+                let Some(code) = usize::from(symbols[voxel]).checked_sub(1) else { continue };
                 let change = |to: usize| {
                     let change = (levels[to] - levels[code]) * self.amplitude[voxel];
                     (change * (2.0 * field.at(voxel) + change), change, to)
@@ -269,7 +287,7 @@ impl<'a> Seen<'a> {
             }
         }
         let given = std::array::from_fn(|voxel| match symbols[voxel] {
-            0 => floor.max(0.0),
+            0 => self.scale.floor.max(0.0),
             symbol => levels[usize::from(symbol) - 1],
         });
         let plain = self.plain_error(&given);
@@ -353,7 +371,7 @@ mod tests {
         let (values, light) = (smoke(), [1.0; 64]);
         let seen = Seen::of(&values, &SCALE, &light);
         for way in seen.ways.iter().filter(|way| (3..=5).contains(&way.bits)) {
-            let coded = seen.code(way, 0.0);
+            let coded = seen.better(seen.nearest(way, 0.0));
             let level = |code: usize| {
                 coded.line.line.low + coded.line.line.step * sparse::bend(way.bits, code as u32)
             };

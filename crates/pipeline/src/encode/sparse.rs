@@ -93,7 +93,8 @@ impl Sparse {
             Codec::Sparse { is_fitted, pairs }
         };
         let mut codecs = self.by_bits.map(|kept| codec(&kept)).to_vec();
-        // With more bits more voxels are kept.
+        // With more bits more voxels are kept, which mostly takes more words; but blocks that become full need no mask.
+        codecs.sort_by_key(|codec| codec.word_count());
         codecs.dedup();
         codecs
     }
