@@ -147,8 +147,10 @@ struct Lighting<'m, 's> {
     density: &'m Field<'s>,
     /// The camera ray's direction in world space.
     view: Vec3,
-    /// The camera ray in the field's positions.
+    /// The camera ray in the field's positions, how far it begins from the camera, and the length of its direction.
     ray: LocalRay,
+    voxels_to_start: f64,
+    voxels_per_length: f32,
     /// The sun: its irradiance times albedo times phase function, and its direction in the field's positions.
     sun: Option<(Vec3, Vec3)>,
     group: Group,
@@ -231,13 +233,15 @@ impl<'s> Marcher<'s> {
             emission.as_ref().map_or(0.0, |(_, _, local, _)| local.direction.length()),
         ];
         let voxels_per_length = voxels_per_length[0].max(voxels_per_length[1]);
+        let step = f64::from(self.quality.step_voxels) / f64::from(voxels_per_length);
         let lattice = Lattice {
-            step: self.quality.step_voxels / voxels_per_length,
-            shift: unit_f32(hash_u32(random)),
+            step: step as f32,
+            // Steps lie where they do whatever box the medium has.
+            shift: (f64::from(unit_f32(hash_u32(random))) - start / step).rem_euclid(1.0) as f32,
             curvature: 0.0,
         };
         let mut lighting =
-            density.as_ref().map(|(field, local, _)| Lighting::new(self, field, ray, *local, random));
+            density.as_ref().map(|(field, local, _)| Lighting::new(self, field, ray, start, *local, random));
 
         let (mut walker, mut shadow) = split(worker.density.as_mut());
         let (mut glow_walker, mut glow) = split(worker.emission.as_mut());
@@ -356,6 +360,7 @@ impl<'m, 's> Lighting<'m, 's> {
         marcher: &'m Marcher<'s>,
         density: &'m Field<'s>,
         ray: &Ray,
+        start: f64,
         local: LocalRay,
         random: u32,
     ) -> Self {
@@ -373,6 +378,8 @@ impl<'m, 's> Lighting<'m, 's> {
             density,
             view,
             ray: local,
+            voxels_to_start: start * f64::from(voxels_per_length),
+            voxels_per_length,
             sun: sun.filter(|(light, _)| *light != Vec3::ZERO),
             group: Group::default(),
             group_lengths: [GROUP_VOXELS / voxels_per_length, FAINT_GROUP_VOXELS / voxels_per_length],
@@ -393,27 +400,35 @@ impl<'m, 's> Lighting<'m, 's> {
     #[inline]
     fn scattered(&mut self, shadow: &mut ShadowReader<'_, 's>, t0: f32, t1: f32, share: f32) -> Vec3 {
         let mut light = Vec3::ZERO;
-        let t = 0.5 * (t0 + t1);
+        let Quality { sun_rays, sky_rays, .. } = self.marcher.quality;
         if self.sun.is_some() {
-            if self.group.share == 0.0 {
-                self.group.start = t0;
-            }
-            self.group.share += share;
-            self.group.moment += share * t;
-            // Of a full group, as one.
-            let part = self.group.share * self.marcher.quality.sun_rays as f32;
-            let longest = self.group_lengths[usize::from(part < FAINT_GROUP)];
-            if part >= 1.0 || t1 - self.group.start >= longest {
-                light += self.close_group(shadow);
+            let full = 1.0 / sun_rays as f32;
+            // A group is full in the midst of a step: what changes little is divided nearly the same.
+            let missing = (full - self.group.share) / share;
+            let cut = if missing < 1.0 && share < full { t0 + missing * (t1 - t0) } else { t1 };
+            for (begin, end) in [(t0, cut), (cut, t1)].into_iter().filter(|(begin, end)| begin < end) {
+                if self.group.share == 0.0 {
+                    self.group.start = begin;
+                }
+                let share = share * ((end - begin) / (t1 - t0));
+                self.group.share += share;
+                self.group.moment += share * 0.5 * (begin + end);
+                let is_full = self.group.share >= full || end == cut && cut < t1;
+                let is_faint = self.group.share < FAINT_GROUP * full;
+                if is_full || end - self.group.start >= self.group_lengths[usize::from(is_faint)] {
+                    light += self.close_group(shadow);
+                }
             }
         }
         if let Some(radiance) = self.sky {
+            let before = self.scattered;
             self.scattered += share;
-            let rays = self.marcher.quality.sky_rays as f32;
+            let rays = sky_rays as f32;
             while self.scattered > self.next_sky {
+                let part = ((self.next_sky - before) / share).clamp(0.0, 1.0);
                 self.next_sky += 1.0 / rays;
                 let direction = self.sky_direction();
-                light += radiance / rays * self.transmittance(shadow, self.ray.at(t), direction);
+                light += radiance / rays * self.transmittance(shadow, t0 + part * (t1 - t0), direction);
             }
         }
         light
@@ -424,7 +439,7 @@ impl<'m, 's> Lighting<'m, 's> {
         let Group { share, moment, .. } = std::mem::take(&mut self.group);
         match self.sun {
             Some((radiance, direction)) if share > 0.0 => {
-                radiance * share * self.transmittance(shadow, self.ray.at(moment / share), direction)
+                radiance * share * self.transmittance(shadow, moment / share, direction)
             }
             _ => Vec3::ZERO,
         }
@@ -443,13 +458,13 @@ impl<'m, 's> Lighting<'m, 's> {
         self.density.directions() * direction
     }
 
-    fn transmittance(&self, shadow: &mut ShadowReader<'_, 's>, position: Vec3, direction: Vec3) -> f32 {
-        let ray = LocalRay::new(position, direction);
-        // The position itself scrambles the lattice, so that neighbouring steps do not share its error.
-        let bits = position.x.to_bits()
-            ^ position.y.to_bits().rotate_left(11)
-            ^ position.z.to_bits().rotate_left(22);
-        let shift = unit_f32(hash_u32(self.random ^ bits));
+    /// The share of the light from a direction that gets to a place on the camera ray.
+    fn transmittance(&self, shadow: &mut ShadowReader<'_, 's>, t: f32, direction: Vec3) -> f32 {
+        let ray = LocalRay::new(self.ray.at(t), direction);
+        // Where the ray begins scrambles the lattice, so that neighbouring steps do not share its error: by voxels, so that
+        // what is nearly the same looks nearly the same.
+        let voxel = (self.voxels_to_start + f64::from(t * self.voxels_per_length)).floor() as i64 as u32;
+        let shift = unit_f32(hash_u32(self.random ^ hash_u32(voxel ^ self.sky_index << 24)));
         let Quality { shadow_step_voxels, shadow_growth, .. } = self.marcher.quality;
         let lattice = Lattice::new(shadow_step_voxels, &ray, shift).growing(shadow_growth);
         let scale = self.marcher.medium.density_scale;

@@ -149,9 +149,9 @@ impl<'a> Measure<'a> {
         }
         let error = self.plain_error(codec)?;
         let (seen, decoded) = (self.seen.as_ref()?, self.decoded(codec)?);
-        // What rounding leaves over is like noise; what is left out and what is but predicted is not.
+        // What rounding leaves over is like noise, and stepped away in part; what is but predicted is not.
         let weighed = match has_codes(codec) || error.max == 0.0 {
-            true => seen.of_noise(&decoded),
+            true => seen.of_codes(&decoded),
             false => seen.of_values(&decoded),
         };
         Some(Error { bias: weighed - error.squared, ..error })
@@ -446,15 +446,15 @@ impl Range {
 pub(super) const NOTHING: Brick = [0.0; BRICK_VOXELS];
 
 /// The voxels of a row along z, and the rows of a brick.
-const ROW: usize = 8;
+pub(super) const ROW: usize = 8;
 const ROWS: usize = BRICK_VOXELS / ROW;
 
-fn row_at(values: &Brick, row: usize) -> &[f32; ROW] {
+pub(super) fn row_at(values: &Brick, row: usize) -> &[f32; ROW] {
     &values.as_chunks().0[row]
 }
 
 /// The rows whose halves along z are the octants `2 quadrant` and `2 quadrant + 1`.
-fn rows_of(quadrant: usize) -> impl Iterator<Item = usize> {
+pub(super) fn rows_of(quadrant: usize) -> impl Iterator<Item = usize> {
     let first = (quadrant >> 1) * 32 + (quadrant & 1) * 4;
     (0..16).map(move |i| first + (i >> 2) * 8 + (i & 3))
 }

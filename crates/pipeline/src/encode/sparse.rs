@@ -9,6 +9,7 @@
 use std::cell::OnceCell;
 
 use fearless_simd::{Simd, dispatch};
+use nuage_volume::codec::sparse::Coding;
 use nuage_volume::codec::{Codec, Line, interpolate_corners, sparse};
 use nuage_volume::space::BRICK_VOXELS;
 
@@ -146,7 +147,7 @@ impl Sparse {
         }
         let codes = quantize(values, predicted, &[line.line; 8], bits, scale);
         let symbol = |i: usize| if kept.holds(values[i]) { codes[i] + 1 } else { 0 };
-        sparse::pack(bits, &std::array::from_fn(symbol), words);
+        sparse::pack(&Coding::even(bits), &std::array::from_fn(symbol), words);
         words.resize(end, 0);
     }
 
@@ -190,7 +191,7 @@ impl Kept {
         let squared = squared.iter().map(|squared| f64::from(*squared)).sum();
         let max = max.into_iter().fold(0.0, f32::max);
         let lost = Error { squared, max, bias: LOST_BIAS * squared };
-        Kept { above, words: sparse::word_count(bits, &is_there), lost }
+        Kept { above, words: sparse::word_count(&Coding::even(bits), &is_there), lost }
     }
 
     #[inline(always)]

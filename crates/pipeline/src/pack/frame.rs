@@ -390,16 +390,18 @@ fn encode_level(level: &Level, choice: &Choice, curves: Option<&[Curve]>) -> (En
     let light_in = |i: usize| light.as_ref().and_then(|light| light.get(i));
     let coded = each(level.bricks.len(), |i| {
         let brick = &level.bricks[i];
-        let best = match curves {
+        let mut best = match curves {
             Some(curves) if choice.asked.is_none() => curves[i].at(choice.lambda),
             _ => choice.best(brick, light_in(i)),
         };
         let mut words = Vec::with_capacity(best.codec.word_count());
-        match (best.codec, light_in(i)) {
-            (Codec::Sparse { pairs, .. }, Some(light)) => {
-                Seen::of(brick, &choice.scale, light).write(pairs, &mut words);
+        match light_in(i) {
+            Some(light) => {
+                let written =
+                    Seen::of(brick, &choice.scale, light).write(best.codec, &choice.shapes, &mut words);
+                best.error = written.unwrap_or(best.error);
             }
-            (codec, _) => write(brick, codec, &choice.scale, &choice.shapes, &mut words),
+            None => write(brick, best.codec, &choice.scale, &choice.shapes, &mut words),
         }
         (best, words)
     });

@@ -28,7 +28,7 @@ use crate::encode::quantize::ChannelScale;
 use crate::encode::shapes::{SHAPE_CODEC, Shapes};
 
 /// Goes up whenever the same frames and options give other bytes than before.
-const REVISION: u32 = 4;
+const REVISION: u32 = 5;
 
 /// The name of the plan among what is kept.
 pub const PLAN: &str = "plan";

@@ -14,6 +14,7 @@ pub mod codes;
 pub mod sparse;
 
 use block::{BlockFormat, PackingAxis};
+use sparse::Coding;
 
 use crate::brick::f32_from_finite_f16;
 use crate::space::BRICK_VOXELS;
@@ -363,10 +364,11 @@ impl BrickContext<'_> {
                 out.iter_mut().enumerate().for_each(|(i, value)| *value = octant_of(i) as f32);
                 codes::unpack(bits, words, out, |octant, code| octants[octant as usize & 7].at(code));
             }
-            (Codec::Sparse { is_fitted, .. }, [line, bits, rest @ ..]) => {
+            (Codec::Sparse { is_fitted, .. }, [line, rest @ ..]) => {
                 let line = Line::from_word(*line, self.unit)?;
+                let (coding, rest) = Coding::from_words(rest).ok_or(DecodeError::Sparse)?;
                 let rest = match (is_fitted, rest) {
-                    (true, [corners, low, high, rest @ ..]) => {
+                    (true, [corners, low, high, rest @ ..]) if coding.ends.is_none() => {
                         decode_corners(Line::from_word(*corners, self.unit)?, [*low, *high], out);
                         rest
                     }
@@ -376,15 +378,16 @@ impl BrickContext<'_> {
                         rest
                     }
                 };
-                let (bits, is_bent) = sparse::code_bits(*bits).ok_or(DecodeError::Sparse)?;
-                let symbols = sparse::unpack(bits, rest).ok_or(DecodeError::Sparse)?;
-                for (value, symbol) in out.iter_mut().zip(symbols) {
+                let symbols = sparse::unpack(&coding, rest).ok_or(DecodeError::Sparse)?;
+                let is_plain = coding.is_even() && !coding.is_bent;
+                for (voxel, (value, symbol)) in out.iter_mut().zip(symbols).enumerate() {
                     *value = match symbol {
                         0 => 0.0,
-                        symbol if is_bent => {
-                            *value + (line.low + line.step * sparse::bend(bits, u32::from(symbol) - 1))
+                        symbol if is_plain => *value + line.at(u32::from(symbol) - 1),
+                        symbol => {
+                            let place = coding.place(octant_of(voxel), u32::from(symbol) - 1);
+                            *value + (line.low + line.step * place)
                         }
-                        symbol => *value + line.at(u32::from(symbol) - 1),
                     };
                 }
             }
@@ -465,7 +468,7 @@ mod tests {
         let (fitted, plain) = ([0x3800 << 16, 2, HALF_ONE, 0, 0], [0x3800 << 16, 2]);
         for (is_fitted, head, predicted) in [(true, &fitted[..], 2.0), (false, &plain[..], 0.0)] {
             let mut words = head.to_vec();
-            sparse::pack(2, &symbols, &mut words);
+            sparse::pack(&Coding::even(2), &symbols, &mut words);
             words.resize(words.len().next_multiple_of(2), 0);
             let codec = Codec::Sparse { is_fitted, pairs: (words.len() / 2) as u8 };
             let decode = |words: &[u32], codec, out: &mut _| {
@@ -479,14 +482,14 @@ mod tests {
                 assert_eq!(*value, expected);
             }
             // Bent, the codes from 0 to 3 stand at 0, 7/15, 22/15 and 3.
-            words[1] = 2 + sparse::BENT;
+            words[1] = 2 + 8;
             decode(&words, codec, &mut out).unwrap();
             for (value, symbol) in out.iter().zip(symbols) {
                 let bent = [0.0, 7.0 / 15.0, 22.0 / 15.0, 3.0];
                 let expected = if symbol > 0 { predicted + bent[usize::from(symbol) - 1] } else { 0.0 };
                 assert!((value - expected).abs() < 1e-6);
             }
-            for none in [0, 8, 16, 17, u32::MAX] {
+            for none in [0, 8, 16, 33, 1 << 8 | 1, u32::MAX] {
                 words[1] = none;
                 assert_eq!(decode(&words, codec, &mut out), Err(DecodeError::Sparse));
             }

@@ -3,7 +3,7 @@
 //! In smoke a code is near the mean of those before it along x, y and z. That mean is the *context*; of each context a
 //! table says how often each symbol follows in the page, and an rANS coder (J. Duda, "Asymmetric numeral systems",
 //! arXiv:1311.2540, section 3) spends bits accordingly. The lowest bits of codes of more than five are noise, and stand as
-//! they are. Two bricks are decoded at a time, each with its own state, since every symbol has to wait for the one before
+//! they are. Four bricks are decoded at a time, each with its own state, since every symbol has to wait for the one before
 //! it.
 //!
 //! How the bytes stand in a page is [`super::page`]'s.
@@ -17,6 +17,12 @@ const SCALE_BITS: u32 = 11;
 const SCALE: u32 = 1 << SCALE_BITS;
 /// A state is at least this, and takes 16 more bits when it falls below.
 const LOW: u32 = 1 << 16;
+
+/// There are at most so many contexts.
+const MAX_CONTEXTS: usize = 2 << SYMBOL_BITS;
+
+/// The bricks whose symbols take turns.
+const TURNS: usize = 4;
 
 type Codes = [u8; BRICK_VOXELS];
 
@@ -51,14 +57,17 @@ pub(super) fn encode(bits: u8, bricks: &[Codes]) -> Vec<u8> {
         .iter()
         .map(|codes| {
             let symbols = codes.map(|code| code >> shape.raw_bits);
-            let mut rows = Rows::default();
-            std::array::from_fn(|i| {
-                // Codes have as many bits as was said, and so a context each.
-                let context = rows.context(&shape, &symbols, i).unwrap_or_default();
-                let place = context * shape.symbols + usize::from(symbols[i]);
-                counts[place] += 1;
-                place as u16
-            })
+            let mut places = [0; BRICK_VOXELS];
+            for row in 0..BRICK_VOXELS / 8 {
+                let (before, count) = neighbours(&symbols, row);
+                for i in 8 * row..8 * row + 8 {
+                    let (z, last) = (i % 8, if i % 8 > 0 { symbols[i - 1] } else { 0 });
+                    let context = shape.context[count + usize::from(z > 0)][usize::from(before[z] + last)];
+                    places[i] = u16::from(context) * shape.symbols as u16 + u16::from(symbols[i]);
+                    counts[usize::from(places[i])] += 1;
+                }
+            }
+            places
         })
         .collect();
     let tables: Vec<Vec<u32>> = counts.chunks(shape.symbols).map(frequencies).collect();
@@ -67,10 +76,10 @@ pub(super) fn encode(bits: u8, bricks: &[Codes]) -> Vec<u8> {
 
     // An rANS coder is a stack: the last symbol is encoded first.
     let mut words: Vec<u16> = Vec::new();
-    for pair in coded.chunks(2).rev() {
-        let mut states = [LOW; 2];
+    for group in coded.chunks(TURNS).rev() {
+        let mut states = [LOW; TURNS];
         for i in (0..BRICK_VOXELS).rev() {
-            for (brick, state) in pair.iter().zip(&mut states).rev() {
+            for (brick, state) in group.iter().zip(&mut states).rev() {
                 let part = &parts[usize::from(brick[i])];
                 if u64::from(*state) >= u64::from(part.frequency) << (32 - SCALE_BITS) {
                     words.push(*state as u16);
@@ -79,7 +88,7 @@ pub(super) fn encode(bits: u8, bricks: &[Codes]) -> Vec<u8> {
                 *state = part.push(*state);
             }
         }
-        for state in states[..pair.len()].iter().rev() {
+        for state in states[..group.len()].iter().rev() {
             words.extend([*state as u16, (*state >> 16) as u16]);
         }
     }
@@ -201,16 +210,16 @@ fn read_table(symbols: usize, bytes: &mut &[u8]) -> Option<Vec<u32>> {
 /// Decodes bricks one after the other.
 pub(super) struct Decoder<'a> {
     shape: Shape,
-    /// The symbol of each part of [`SCALE`], context by context.
-    symbols: Vec<u8>,
-    /// Frequency in the upper half and start in the lower, by context and symbol.
-    ranges: Vec<u32>,
+    /// The symbol of each part of [`SCALE`], by context. A byte each, so that the tables of most bricks stay in the first cache.
+    symbols: Box<[[u8; SCALE as usize]; MAX_CONTEXTS]>,
+    /// Frequency in the upper half and start in the lower, by context and symbol. 0 in a context without a table.
+    ranges: Box<[[u32; 1 << SYMBOL_BITS]; MAX_CONTEXTS]>,
     /// The coded words, two bytes each.
-    words: &'a [u8],
+    words: &'a [[u8; 2]],
     raw: &'a [u8],
     bricks_left: usize,
-    /// The second brick of a pair.
-    second: Option<Codes>,
+    /// Bricks that were decoded with another, the next one last.
+    waiting: Vec<Codes>,
 }
 
 impl<'a> Decoder<'a> {
@@ -218,32 +227,40 @@ impl<'a> Decoder<'a> {
     pub(super) fn new(bits: u8, bricks: usize, mut bytes: &'a [u8]) -> Option<Decoder<'a>> {
         let shape = Shape::new(bits);
         let raw = bytes.split_off(..BRICK_VOXELS / 8 * shape.raw_bits as usize * bricks)?;
-        let mut symbols = vec![0; shape.contexts << SCALE_BITS];
-        let mut ranges = vec![0; shape.contexts * shape.symbols];
+        let mut symbols: Box<[_; MAX_CONTEXTS]> = vec![[0; SCALE as usize]; MAX_CONTEXTS].try_into().ok()?;
+        let mut ranges = Box::new([[0; 1 << SYMBOL_BITS]; MAX_CONTEXTS]);
         for context in 0..shape.contexts {
-            let table = read_table(shape.symbols, &mut bytes)?;
-            let starts = starts(&table);
-            for (symbol, (frequency, start)) in table.iter().zip(&starts).enumerate() {
-                let begin = (context << SCALE_BITS) + *start as usize;
-                symbols[begin..begin + *frequency as usize].fill(symbol as u8);
-                ranges[context * shape.symbols + symbol] = frequency << 16 | start;
+            let mut start = 0;
+            for (symbol, frequency) in read_table(shape.symbols, &mut bytes)?.into_iter().enumerate() {
+                symbols[context][start as usize..(start + frequency) as usize].fill(symbol as u8);
+                ranges[context][symbol] = frequency << 16 | start;
+                start += frequency;
             }
         }
-        Some(Decoder { shape, symbols, ranges, words: bytes, raw, bricks_left: bricks, second: None })
+        let words = bytes.as_chunks().0;
+        Some(Decoder {
+            shape,
+            symbols,
+            ranges,
+            words,
+            raw,
+            bricks_left: bricks,
+            waiting: Vec::with_capacity(TURNS),
+        })
     }
 
     /// The codes of the next brick. `None` if there is none or the words are damaged.
     pub(super) fn next_brick(&mut self) -> Option<Codes> {
-        let mut codes = match self.second.take() {
-            Some(codes) => codes,
-            None if self.bricks_left == 0 => return None,
-            None if self.bricks_left == 1 => self.one()?,
-            None => {
-                let [first, second] = self.pair()?;
-                self.second = Some(second);
-                first
+        if self.waiting.is_empty() {
+            match self.bricks_left {
+                0 => return None,
+                1 => self.decode::<1>()?,
+                2 => self.decode::<2>()?,
+                3 => self.decode::<3>()?,
+                _ => self.decode::<TURNS>()?,
             }
-        };
+        }
+        let mut codes = self.waiting.pop()?;
         self.bricks_left -= 1;
         let raw_bits = self.shape.raw_bits;
         if raw_bits > 0 {
@@ -256,81 +273,61 @@ impl<'a> Decoder<'a> {
         Some(codes)
     }
 
-    fn word(&mut self) -> Option<u32> {
-        let bytes = self.words.split_off(..2)?;
-        Some(u32::from(u16::from_le_bytes(*bytes.first_chunk()?)))
-    }
-
-    fn state(&mut self) -> Option<u32> {
-        Some(self.word()? << 16 | self.word()?)
-    }
-
-    fn symbol(&mut self, state: &mut u32, context: usize) -> Option<u8> {
-        let part = *state & (SCALE - 1);
-        let symbol = *self.symbols.get((context << SCALE_BITS) + part as usize)?;
-        let range = *self.ranges.get(context * self.shape.symbols + usize::from(symbol))?;
-        // Below 2³²: the frequency is at most `SCALE`. A context without a table has the range 0, and no symbol.
-        let above = (range >> 16) * (*state >> SCALE_BITS);
-        *state = above.checked_add(part)?.checked_sub(range & 0xffff).filter(|_| range >> 16 > 0)?;
-        if *state < LOW {
-            *state = *state << 16 | self.word()?;
-        }
-        Some(symbol)
-    }
-
-    fn one(&mut self) -> Option<Codes> {
-        let mut state = self.state()?;
-        let mut out = [0; BRICK_VOXELS];
-        let mut rows = Rows::default();
-        for i in 0..BRICK_VOXELS {
-            let context = rows.context(&self.shape, &out, i)?;
-            out[i] = self.symbol(&mut state, context)?;
-        }
-        Some(out)
-    }
-
-    /// Two bricks, voxel by voxel in turn: while one waits for its table, the other goes on.
-    fn pair(&mut self) -> Option<[Codes; 2]> {
-        let mut states = [self.state()?, self.state()?];
-        let mut out = [[0; BRICK_VOXELS]; 2];
-        let mut rows = [Rows::default(), Rows::default()];
-        for i in 0..BRICK_VOXELS {
-            for brick in 0..2 {
-                let context = rows[brick].context(&self.shape, &out[brick], i)?;
-                out[brick][i] = self.symbol(&mut states[brick], context)?;
-            }
-        }
-        Some(out)
-    }
-}
-
-/// What a walk through a brick keeps of the row it is in: sums of the neighbours along x and y, and how many those are.
-#[derive(Default)]
-struct Rows {
-    before: [u8; 8],
-    count: usize,
-}
-
-impl Rows {
-    /// The context of voxel `i`, when all before it are known.
-    fn context(&mut self, shape: &Shape, out: &Codes, i: usize) -> Option<usize> {
-        let (row, z) = (i / 8, i % 8);
-        if z == 0 {
-            (self.before, self.count) = ([0; 8], 0);
-            for (is_there, distance) in [(row >= 8, 64), (row % 8 > 0, 8)] {
-                if is_there {
-                    let from = i - distance;
-                    self.before.iter_mut().zip(&out[from..from + 8]).for_each(|(sum, code)| *sum += code);
-                    self.count += 1;
+    /// Some bricks, voxel by voxel in turn: while one waits for its table, the others go on.
+    fn decode<const N: usize>(&mut self) -> Option<()> {
+        let mut out = [[0; BRICK_VOXELS]; N];
+        let (first, mut words) = self.words.split_at_checked(2 * N)?;
+        let word = |word: [u8; 2]| u32::from(u16::from_le_bytes(word));
+        let mut states: [u32; N] = std::array::from_fn(|i| word(first[2 * i]) << 16 | word(first[2 * i + 1]));
+        let mut least = u32::MAX;
+        for row in 0..BRICK_VOXELS / 8 {
+            let neighbours = std::array::from_fn::<_, N, _>(|i| neighbours(&out[i], row));
+            // Each symbol takes a word at most.
+            let (mut padded, mut taken) = ([[0; 2]; 8 * TURNS], 0);
+            let next = words.first_chunk().unwrap_or_else(|| {
+                padded[..words.len()].copy_from_slice(words);
+                &padded
+            });
+            let mut last = [0; N];
+            for z in 0..8 {
+                for i in 0..N {
+                    let (before, count) = &neighbours[i];
+                    let contexts = &self.shape.context[count + usize::from(z > 0)];
+                    let context = usize::from(contexts[usize::from(before[z] + last[i])]);
+                    let part = states[i] & (SCALE - 1);
+                    let symbol = self.symbols[context % MAX_CONTEXTS][part as usize];
+                    let range = self.ranges[context % MAX_CONTEXTS][usize::from(symbol) % (1 << SYMBOL_BITS)];
+                    least = least.min(range);
+                    last[i] = symbol;
+                    out[i][8 * row + z] = symbol;
+                    // Below 2³²: the frequency is at most `SCALE`.
+                    let above = (range >> 16).wrapping_mul(states[i] >> SCALE_BITS);
+                    let state = above.wrapping_add(part.wrapping_sub(range & 0xffff));
+                    let is_low = state < LOW;
+                    states[i] = if is_low { state << 16 | word(next[taken % next.len()]) } else { state };
+                    taken += usize::from(is_low);
                 }
             }
+            words = words.get(taken..)?;
         }
-        let last = if z > 0 { out[i - 1] } else { 0 };
-        let neighbours = self.count + usize::from(z > 0);
-        shape.context[neighbours & 3]
-            .get(usize::from(self.before[z] + last))
-            .map(|context| usize::from(*context))
+        self.words = words;
+        self.waiting.extend(out.iter().rev());
+        (least > 0).then_some(())
     }
+}
+
+/// Sums of the neighbours of a row of voxels along x and y, and how many those are.
+#[inline]
+fn neighbours(symbols: &Codes, row: usize) -> ([u8; 8], usize) {
+    let (mut sums, mut count) = ([0; 8], 0);
+    for (is_there, distance) in [(row >= 8, 64), (!row.is_multiple_of(8), 8)] {
+        if is_there {
+            let from = 8 * row - distance;
+            sums.iter_mut().zip(&symbols[from..from + 8]).for_each(|(sum, symbol)| *sum += symbol);
+            count += 1;
+        }
+    }
+    (sums, count)
 }
 
 #[cfg(test)]

@@ -8,7 +8,8 @@
 
 use super::entropy;
 use super::predict::{Number, Predictor, residuals, restore};
-use crate::codec::{Codec, codes, sparse};
+use crate::codec::sparse::{self, Coding};
+use crate::codec::{Codec, codes, octant_of};
 use crate::space::BRICK_VOXELS;
 
 /// The groups of bricks whose values stand together: one for each tag but those of sparse bricks, then one for each number of bits of
@@ -21,7 +22,7 @@ fn group(codec: Codec, sparse_bits: u32) -> usize {
     match codec {
         Codec::Sparse { is_fitted, .. } => {
             // Any other number is in no file that decodes; such words stand as they are in the last group.
-            let bits = sparse::code_bits(sparse_bits).map_or(sparse::MAX_BITS, |(bits, _)| bits);
+            let bits = Coding::from_word(sparse_bits).map_or(sparse::MAX_BITS, |coding| coding.most_bits);
             FIRST_SPARSE + usize::from(bits) - 1 + if is_fitted { usize::from(sparse::MAX_BITS) } else { 0 }
         }
         codec => usize::from(codec.tag()),
@@ -68,7 +69,8 @@ const SHAPE_TAGS: usize = 3;
 const OCTANTS: usize = 4;
 const LATTICES: usize = 5;
 const SPARSE_BITS: usize = 6;
-const HEAD_STREAMS: usize = 7;
+const SPARSE_ENDS: usize = 7;
+const HEAD_STREAMS: usize = 8;
 
 /// The streams of a lattice with codes.
 const LATTICE: [usize; 18] = {
@@ -77,8 +79,8 @@ const LATTICE: [usize; 18] = {
     streams
 };
 
-/// Which streams the first words of a brick go to.
-fn head(codec: Codec) -> &'static [usize] {
+/// Which streams the first words of a brick go to. The second word of a sparse one may say that others follow.
+fn head(codec: Codec, sparse_bits: u32) -> &'static [usize] {
     match codec {
         Codec::Constant | Codec::F16 | Codec::F32 => &[],
         Codec::Uniform { .. } | Codec::Block { .. } => &[LINES],
@@ -87,6 +89,9 @@ fn head(codec: Codec) -> &'static [usize] {
         Codec::Lattice { bits: 0 } => LATTICE.split_last().map_or(&[], |(_, head)| head),
         Codec::Lattice { .. } => &LATTICE,
         Codec::Split { .. } => &[LINES, OCTANTS, OCTANTS, OCTANTS, OCTANTS],
+        Codec::Sparse { is_fitted: false, pairs } if sparse_bits & sparse::HAS_ENDS > 0 && pairs > 1 => {
+            &[LINES, SPARSE_BITS, SPARSE_ENDS, SPARSE_ENDS]
+        }
         Codec::Sparse { is_fitted: false, .. } => &[LINES, SPARSE_BITS],
         Codec::Sparse { is_fitted: true, .. } => &[LINES, SPARSE_BITS, LINES, CORNERS, CORNERS],
         Codec::Shared => &[LINES, SHAPE_OFFSETS, SHAPE_TAGS],
@@ -98,7 +103,7 @@ fn head(codec: Codec) -> &'static [usize] {
 enum Values {
     None,
     Codes(u8),
-    /// Masks and codes of the voxels that are there, of so many bits.
+    /// Masks and codes of the voxels that are there, of so many bits or fewer.
     Sparse(u8),
     /// Texture blocks, which have no neighbours that predict them.
     Blocks,
@@ -154,6 +159,14 @@ pub(super) fn max_encoded_bytes(codecs: &[Codec]) -> u64 {
     codecs.iter().map(bytes).sum::<u64>() + 5 * GROUPS as u64
 }
 
+/// The words of a brick after its head.
+#[derive(Clone, Copy)]
+struct Brick<'a> {
+    /// The word of a sparse one that says the bits of its codes.
+    sparse_bits: u32,
+    values: &'a [u32],
+}
+
 /// The bytes of the words of some bricks, one after the other.
 pub(super) fn encode(codecs: &[Codec], words: &[u32]) -> Vec<u8> {
     let mut heads = [const { Vec::new() }; HEAD_STREAMS];
@@ -161,9 +174,11 @@ pub(super) fn encode(codecs: &[Codec], words: &[u32]) -> Vec<u8> {
     let mut rest = words;
     for codec in codecs {
         let (brick, after) = rest.split_at(codec.word_count());
-        let (first, last) = brick.split_at(head(*codec).len());
-        first.iter().zip(head(*codec)).for_each(|(word, stream)| heads[*stream].push(*word));
-        values[group(*codec, first.get(1).copied().unwrap_or_default())].push(last);
+        let sparse_bits = brick.get(1).copied().unwrap_or_default();
+        let streams = head(*codec, sparse_bits);
+        let (first, last) = brick.split_at(streams.len());
+        first.iter().zip(streams).for_each(|(word, stream)| heads[*stream].push(*word));
+        values[group(*codec, sparse_bits)].push(Brick { sparse_bits, values: last });
         rest = after;
     }
     let mut out = vec![0; GROUPS];
@@ -196,25 +211,27 @@ pub(super) fn encode(codecs: &[Codec], words: &[u32]) -> Vec<u8> {
 /// The words of bricks of these codecs from what [`encode`] made of them. `None` if it made no such bytes.
 pub(super) fn decode(codecs: &[Codec], bytes: &[u8]) -> Option<Vec<u32>> {
     let (modes, mut rest) = bytes.split_at_checked(GROUPS)?;
+    // What says the heads and the groups of sparse bricks stands in a stream before those that hang on it.
     let mut head_counts = [0; HEAD_STREAMS];
     for codec in codecs {
-        head(*codec).iter().for_each(|stream| head_counts[*stream] += 1);
+        head(*codec, 0).iter().for_each(|stream| head_counts[*stream] += 1);
     }
     let mut heads = [const { Planes::<4>::NONE }; HEAD_STREAMS];
-    for (head, count) in heads.iter_mut().zip(head_counts) {
+    for (head, count) in heads[..SPARSE_ENDS].iter_mut().zip(head_counts) {
         *head = Planes::new(rest.split_off(..4 * count)?);
     }
-    // What says the group of a sparse brick stands among the first words.
     let mut sparse_bits = heads[SPARSE_BITS].clone();
-    let (mut groups, mut counts) = (Vec::with_capacity(codecs.len()), [(0, 0); GROUPS]);
+    let (mut bricks, mut counts, mut ends) = (Vec::with_capacity(codecs.len()), [(0, 0); GROUPS], 0);
     for codec in codecs {
         let bits = if let Codec::Sparse { .. } = codec { u32::from_le_bytes(sparse_bits.next()?) } else { 0 };
-        let group = group(*codec, bits);
-        let (bricks, words) = &mut counts[group];
-        *bricks += 1;
-        *words += codec.word_count().checked_sub(head(*codec).len())?;
-        groups.push(group);
+        let (group, streams) = (group(*codec, bits), head(*codec, bits));
+        let (count, words) = &mut counts[group];
+        *count += 1;
+        *words += codec.word_count().checked_sub(streams.len())?;
+        ends += streams.iter().filter(|stream| **stream == SPARSE_ENDS).count();
+        bricks.push((bits, group, streams));
     }
+    heads[SPARSE_ENDS] = Planes::new(rest.split_off(..4 * ends)?);
     let mut streams = [const { None }; GROUPS];
     for (group, stream) in streams.iter_mut().enumerate() {
         let Some(values) = Values::of_group(group) else { continue };
@@ -226,20 +243,21 @@ pub(super) fn decode(codecs: &[Codec], bytes: &[u8]) -> Option<Vec<u32>> {
         return None;
     }
     let mut words = Vec::with_capacity(codecs.iter().map(|codec| codec.word_count()).sum());
-    for (codec, group) in codecs.iter().zip(groups) {
-        for stream in head(*codec) {
+    for (codec, (sparse_bits, group, head)) in codecs.iter().zip(bricks) {
+        for stream in head {
             words.push(u32::from_le_bytes(heads[*stream].next()?));
         }
-        let values = codec.word_count() - head(*codec).len();
-        streams[group].as_mut()?.next_brick(values, &mut words)?;
+        let values = codec.word_count() - head.len();
+        streams[group].as_mut()?.next_brick(sparse_bits, values, &mut words)?;
     }
     Some(words)
 }
 
 /// The values of all bricks of a group in one mode. `None` if they cannot stand in it.
-fn encode_values(values: Values, mode: Mode, bricks: &[&[u32]]) -> Option<Vec<u8>> {
-    let codes_of =
-        |bits: u8| bricks.iter().map(move |brick| std::array::from_fn(|i| codes::code(bits, brick, i) as u8));
+fn encode_values(values: Values, mode: Mode, bricks: &[Brick]) -> Option<Vec<u8>> {
+    let codes_of = |bits: u8| {
+        bricks.iter().map(move |brick| std::array::from_fn(|i| codes::code(bits, brick.values, i) as u8))
+    };
     let coded = |bits, codes: &[[u8; BRICK_VOXELS]]| {
         let coded = entropy::encode(bits, codes);
         [&(coded.len() as u32).to_le_bytes()[..], &coded].concat()
@@ -247,16 +265,17 @@ fn encode_values(values: Values, mode: Mode, bricks: &[&[u32]]) -> Option<Vec<u8
     Some(match (values, mode) {
         (Values::None, _) => Vec::new(),
         (Values::Codes(_) | Values::Sparse(_), Mode::Words) | (Values::Blocks, _) => {
-            bricks.iter().flat_map(|brick| *brick).flat_map(|word| word.to_le_bytes()).collect()
+            bricks.iter().flat_map(|brick| brick.values).flat_map(|word| word.to_le_bytes()).collect()
         }
         (Values::Codes(bits), Mode::Coded) => coded(bits, &codes_of(bits).collect::<Vec<_>>()),
         (Values::Sparse(bits), Mode::Coded) => {
             // Words that are not as they would be packed do not come back from symbols.
-            let symbols = |brick: &&[u32]| {
-                let symbols = sparse::unpack(bits, brick)?;
-                let mut packed = Vec::with_capacity(brick.len());
-                pack_sparse(bits, &symbols, brick.len(), &mut packed)?;
-                (packed == *brick).then_some(symbols)
+            let symbols = |brick: &Brick| {
+                let coding = Coding::from_word(brick.sparse_bits)?;
+                let symbols = sparse::unpack(&coding, brick.values)?;
+                let mut packed = Vec::with_capacity(brick.values.len());
+                pack_sparse(&coding, &symbols, brick.values.len(), &mut packed)?;
+                (packed == brick.values).then_some(symbols)
             };
             coded(bits + 1, &bricks.iter().map(symbols).collect::<Option<Vec<_>>>()?)
         }
@@ -270,22 +289,26 @@ fn encode_values(values: Values, mode: Mode, bricks: &[&[u32]]) -> Option<Vec<u8
         }
         (Values::Sparse(_), Mode::Predicted(_)) => return None,
         (Values::Halves, _) => {
-            let words = bricks.iter().flat_map(|brick| *brick);
+            let words = bricks.iter().flat_map(|brick| brick.values);
             let halves: Vec<u16> = words.flat_map(|word| [*word as u16, (*word >> 16) as u16]).collect();
             let bricks = predicted(&halves, mode, ordered_half);
             split_planes::<2>(bricks.iter().map(|half| half.to_le_bytes()))
         }
         (Values::Floats, _) => {
-            let bricks = predicted(&bricks.concat(), mode, ordered_float);
+            let bricks = predicted(
+                &bricks.iter().flat_map(|brick| brick.values).copied().collect::<Vec<_>>(),
+                mode,
+                ordered_float,
+            );
             split_planes::<4>(bricks.iter().map(|word| word.to_le_bytes()))
         }
     })
 }
 
 /// Appends the words of a sparse brick, and zeros up to `len` of them. `None` if these are too few.
-fn pack_sparse(bits: u8, symbols: &sparse::Symbols, len: usize, words: &mut Vec<u32>) -> Option<()> {
+fn pack_sparse(coding: &Coding, symbols: &sparse::Symbols, len: usize, words: &mut Vec<u32>) -> Option<()> {
     let begin = words.len();
-    sparse::pack(bits, symbols, words);
+    sparse::pack(coding, symbols, words);
     let end = begin + len;
     (words.len() <= end).then(|| words.resize(end, 0))
 }
@@ -308,7 +331,7 @@ enum Stream<'a> {
     Packed { bytes: &'a [u8] },
     Codes { bits: u8, predictor: Predictor, bytes: &'a [u8] },
     Coded { bits: u8, decoder: Box<entropy::Decoder<'a>> },
-    Sparse { bits: u8, decoder: Box<entropy::Decoder<'a>> },
+    Sparse { decoder: Box<entropy::Decoder<'a>> },
     Halves { mode: Mode, planes: Planes<'a, 2> },
     Floats { mode: Mode, planes: Planes<'a, 4> },
 }
@@ -322,7 +345,7 @@ impl<'a> Stream<'a> {
                 Stream::Coded { bits, decoder: Box::new(entropy::Decoder::new(bits, bricks, bytes)?) }
             }
             (Values::Sparse(bits), Mode::Coded) => {
-                Stream::Sparse { bits, decoder: Box::new(entropy::Decoder::new(bits + 1, bricks, bytes)?) }
+                Stream::Sparse { decoder: Box::new(entropy::Decoder::new(bits + 1, bricks, bytes)?) }
             }
             (_, Mode::Coded) | (Values::Sparse(_), Mode::Predicted(_)) => return None,
             (Values::None, _) => Stream::None,
@@ -337,7 +360,7 @@ impl<'a> Stream<'a> {
     }
 
     /// Appends the values of the next brick, which are `len` words. `None` if there is none.
-    fn next_brick(&mut self, len: usize, words: &mut Vec<u32>) -> Option<()> {
+    fn next_brick(&mut self, sparse_bits: u32, len: usize, words: &mut Vec<u32>) -> Option<()> {
         match self {
             Stream::None => {}
             Stream::Packed { bytes } => {
@@ -345,12 +368,17 @@ impl<'a> Stream<'a> {
                 words.extend(brick.as_chunks().0.iter().map(|word| u32::from_le_bytes(*word)));
             }
             Stream::Coded { bits, decoder } => codes::pack(*bits, &decoder.next_brick()?, words),
-            Stream::Sparse { bits, decoder } => {
+            Stream::Sparse { decoder } => {
+                let coding = Coding::from_word(sparse_bits)?;
                 let symbols = decoder.next_brick()?;
-                if symbols.iter().any(|symbol| *symbol > 1 << *bits) {
+                let most = coding.bits.map(|bits| 1 << bits);
+                let is_too_large = |(voxel, symbol): (usize, &u8)| *symbol > most[octant_of(voxel)];
+                // In most bricks all symbols are small enough for any octant.
+                let largest = symbols.iter().fold(0, |largest, symbol| largest.max(*symbol));
+                if most.iter().any(|most| largest > *most) && symbols.iter().enumerate().any(is_too_large) {
                     return None;
                 }
-                pack_sparse(*bits, &symbols, len, words)?;
+                pack_sparse(&coding, &symbols, len, words)?;
             }
             Stream::Codes { bits, predictor, bytes } => {
                 let mut numbers: [u8; BRICK_VOXELS] = *bytes.split_off(..BRICK_VOXELS)?.first_chunk()?;
@@ -495,17 +523,22 @@ pub(super) mod tests {
             if let Codec::Sparse { .. } = codec
                 && !is_noise
             {
-                let begin = first as usize + head(*codec).len();
-                let bits = (i % usize::from(sparse::MAX_BITS)) as u8 + 1;
-                words[first as usize + 1] = u32::from(bits);
+                let most_bits = (i % usize::from(sparse::MAX_BITS)) as u8 + 1;
+                let bits =
+                    std::array::from_fn(|octant| (most_bits - 1).min(octant as u8 % 3 * (seed & 1) as u8));
+                let coding = Coding { bits: bits.map(|fewer| most_bits - fewer), ..Coding::even(most_bits) };
+                let mut head_words = Vec::new();
+                coding.write(&mut head_words);
+                words[first as usize + 1] = head_words[0] | if seed & 2 > 0 { sparse::HAS_ENDS } else { 0 };
+                let begin = first as usize + head(*codec, words[first as usize + 1]).len();
                 // As many voxels as there is room for, at most.
                 let voxels = 8 * (words.len() - begin);
                 let symbols = std::array::from_fn(|voxel| match voxel < voxels.saturating_sub(64) {
-                    true => mixed(seed ^ voxel as u32) as u8 % (1 << bits) + 1,
+                    true => mixed(seed ^ voxel as u32) as u8 % (1 << coding.bits[octant_of(voxel)]) + 1,
                     false => 0,
                 });
                 let mut packed = Vec::new();
-                if pack_sparse(bits, &symbols, words.len() - begin, &mut packed).is_some() {
+                if pack_sparse(&coding, &symbols, words.len() - begin, &mut packed).is_some() {
                     words[begin..].copy_from_slice(&packed);
                 }
             }
@@ -533,9 +566,9 @@ pub(super) mod tests {
         fn values_come_back_in_every_mode(tag in prop::sample::select(vec![1_u8, 2, 3, 4, 5, 6, 7, 8, 9, 10, 19]), seed in any::<u32>()) {
             let codec = Codec::from_tag(tag).unwrap();
             let values = Values::of_group(usize::from(tag)).unwrap();
-            let count = codec.word_count() - head(codec).len();
+            let count = codec.word_count() - head(codec, 0).len();
             let words: Vec<u32> = (0..3 * count as u32).map(|i| mixed(i ^ seed)).collect();
-            let bricks: Vec<&[u32]> = words.chunks(count).collect();
+            let bricks: Vec<Brick> = words.chunks(count).map(|values| Brick { sparse_bits: 0, values }).collect();
             let modes = Predictor::ALL.map(Mode::Predicted).into_iter().chain([Mode::Words, Mode::Coded]);
             for mode in modes.filter(|mode| *mode != Mode::Coded || matches!(values, Values::Codes(_))) {
                 prop_assert_eq!(Mode::from_number(mode.number()), Some(mode));
@@ -545,7 +578,7 @@ pub(super) mod tests {
                 prop_assert!(rest.is_empty());
                 let mut stream = Stream::new(values, mode, 3, taken).unwrap();
                 let mut found = Vec::new();
-                (0..3).for_each(|_| stream.next_brick(count, &mut found).unwrap());
+                (0..3).for_each(|_| stream.next_brick(0, count, &mut found).unwrap());
                 prop_assert_eq!(&found, &words);
             }
         }
@@ -557,7 +590,7 @@ pub(super) mod tests {
                 if height + noise < 5 { (height + noise) as u8 + 1 } else { 0 }
             });
             let mut words = vec![0, 3];
-            sparse::pack(3, &symbols, &mut words);
+            sparse::pack(&Coding::even(3), &symbols, &mut words);
             words.resize(words.len().next_multiple_of(2), 0);
             let codecs = [Codec::Sparse { is_fitted: false, pairs: (words.len() / 2) as u8 }; 40];
             let words = words.repeat(40);
