@@ -16,7 +16,8 @@ use nuage_volume::space::BRICK_VOXELS;
 use super::quantize::{Brick, ChannelScale, Error, ROW, SIMD, StoredLine, decode, row_at, rows_of, write};
 use super::shapes::Shapes;
 
-/// How much light gets to each block of 2³ voxels of a brick, block `x << 4 | y << 2 | z`, as an amplitude up to 1.
+/// What errors in each block of 2³ voxels of a brick are multiplied by, block `x << 4 | y << 2 | z`: how much light gets there, as an
+/// amplitude.
 pub type Light = [f32; 64];
 
 /// The voxels along an axis whose errors count together.

@@ -205,7 +205,7 @@ impl Choice {
 
     /// The light in each brick, if errors count by it.
     fn light(&self, level: &Level) -> Option<Vec<Light>> {
-        self.is_lit.then(|| light::light(level))
+        self.is_lit.then(|| light::light(level, self.scale.unit))
     }
 
     /// The codecs that are the best for a brick with some λ up to that of the choice.

@@ -2,8 +2,9 @@
 //!
 //! A budget of words is best spent where it shows. Nothing is known here of cameras and lights, so what counts is the light that
 //! gets from the outside to a place and back out, on the way of any of 26 directions, through cells of a few voxels taken as
-//! homogeneous, in a medium so dense that a good part of it is hidden. What errors then count is the encoder's
-//! ([`seen`](crate::encode::seen)).
+//! homogeneous, in a medium so dense that a good part of it is hidden. Each frame is taken to be as dense as that: an error shows
+//! by what it is of the optical depth, so those of the thin last frames of an explosion count more than the same ones in its dense
+//! first. What errors then count is the encoder's ([`seen`](crate::encode::seen)).
 
 use glam::IVec3;
 use nuage_volume::build::TileSize;
@@ -41,8 +42,11 @@ struct Cells {
     first: IVec3,
 }
 
-/// The light in each brick of a density, for errors to be multiplied by.
-pub(super) fn light(level: &Level) -> Vec<Light> {
+/// What an extinction of so much in a voxel of the channel's unit may count, so that nothing is lost in single precision.
+const EXTINCTIONS: [f32; 2] = [1.0 / 1024.0, 1024.0];
+
+/// The light in each brick of a density times the optical depth of a voxel of the unit, for errors in that unit to be multiplied by.
+pub(super) fn light(level: &Level, unit: f32) -> Vec<Light> {
     let Some(cells) = Cells::of(level) else { return vec![[1.0; 64]; level.bricks.len()] };
     let extinction = OPTICAL_DEPTH / cells.denser_depth();
     let mut light = vec![0.0; cells.means.len()];
@@ -55,12 +59,14 @@ pub(super) fn light(level: &Level) -> Vec<Light> {
             .zip(&depth)
             .for_each(|(sum, depth)| *sum += (-2.0 * extinction * depth).exp() / 26.0);
     }
+    let [least, most] = EXTINCTIONS;
+    let in_unit = (extinction * unit).clamp(least, most);
     let rounded = |light: f32| ((light / STEP).round() * STEP).max(LEAST);
     let in_brick = |place: &IVec3| {
         let [x, y, z] = cells.first_cell(*place);
         std::array::from_fn(|block| {
             let [i, j, k] = [block >> 4, block >> 2 & 3, block & 3].map(|c| c * cells.per_brick / 4);
-            rounded(light[cells.index([x + i, y + j, z + k])])
+            in_unit * rounded(light[cells.index([x + i, y + j, z + k])])
         })
     };
     level.places.iter().map(in_brick).collect()
@@ -187,7 +193,7 @@ mod tests {
     #[test]
     fn what_lies_deeper_has_less_light_whatever_the_density() {
         let level = ball(6, 1.0);
-        let lit = light(&level);
+        let lit = light(&level, 1.0);
         let at = |place: IVec3| lit[level.places.iter().position(|p| *p == place).unwrap()];
         // The blocks of a row of bricks from the middle to the outside.
         let along: Vec<f32> = (0..=6)
@@ -195,23 +201,30 @@ mod tests {
             .map(|(x, i)| at(IVec3::new(x, 0, 0))[i << 4])
             .collect();
         assert!(along[2..].is_sorted(), "{along:?}");
-        assert!(along[2] <= 0.02 && along[27] >= 0.3, "{along:?}");
+        assert!(along[2] <= 0.06 * along[27], "{along:?}");
+        // Thirteen bricks across, a column of which has the whole depth.
+        let extinction = OPTICAL_DEPTH / (13.0 * 4.0);
+        assert!((0.3 * extinction..extinction).contains(&along[27]), "{along:?}");
         let mirrored = |x: i32| at(IVec3::new(0, 0, x));
         assert_eq!(mirrored(3)[2], at(IVec3::new(3, 0, 0))[2 << 4]);
+        // The thinner, the more the same error counts.
         for density in [1e-30, 1e30] {
-            assert_eq!(light(&ball(6, density)), lit);
+            let scaled = light(&ball(6, density), density).into_iter();
+            assert!(scaled.zip(&lit).all(|(a, b)| a.iter().zip(b).all(|(a, b)| (a / b - 1.0).abs() < 1e-5)));
+            let [thin, dense] = [0.5 * density, density].map(|value| light(&ball(1, value), density)[0][0]);
+            assert!((thin / dense - 2.0).abs() < 1e-5);
         }
     }
 
     #[test]
     fn tiles_cast_shadows_and_what_is_too_large_is_all_lit() {
         let mut level = ball(0, 1.0);
-        let alone = light(&level);
+        let alone = light(&level, 1.0);
         level.tiles.push((IVec3::splat(1), TileSize::Node4, 1.0));
-        let shaded = light(&level);
+        let shaded = light(&level, 1.0);
         assert!(shaded.len() == 1 && shaded[0][63] != alone[0][63]);
         level.tiles.push((IVec3::splat(1 << 20), TileSize::Brick, 1.0));
-        assert_eq!(light(&level), [[1.0; 64]]);
-        assert!(light(&Level::default()).is_empty());
+        assert_eq!(light(&level, 1.0), [[1.0; 64]]);
+        assert!(light(&Level::default(), 1.0).is_empty());
     }
 }
