@@ -94,3 +94,37 @@ for kernel in nearest trilinear exact cubic track; do
   compare "$kernel" "$kernel" "$kernel-spans" "${files[0]}"
 done
 compare surface-shaded surface-shaded surface-shaded "${files[1]}"
+
+# Delta tracking is held against the peer's by means of blocks over independent pictures.
+pictures=64
+side=128
+block_means() {
+  od -An -v -w4 -t f4 "$1" | awk -v side="$side" '
+    { i = NR - 1; sum[int(int(i / side) / 8) * (side / 8) + int(i % side / 8)] += $1 }
+    END { for (b = 0; b < side * side / 64; b++) printf "%.9g ", sum[b] / 64; print "" }'
+}
+nvdb=$out/$(basename "${files[0]}" .vdb).nvdb
+: >"$out/ours.blocks" && : >"$out/peer.blocks"
+for ((seed = 1; seed <= pictures; seed++)); do
+  "$ours" "${files[0]}" track 1 1 "$side" "$out/ours.f32" "$seed" >/dev/null
+  "$peer" "$nvdb" track-spans 1 1 "$side" "$out/peer.f32" "$seed" >/dev/null
+  block_means "$out/ours.f32" >>"$out/ours.blocks"
+  block_means "$out/peer.f32" >>"$out/peer.blocks"
+done
+awk -v n="$pictures" -v side="$side" '
+  { f = FILENAME ~ /peer/; for (b = 1; b <= NF; b++) { sum[f, b] += $b; squares[f, b] += $b * $b } }
+  END {
+    for (b = 1; b <= NF; b++) {
+      error = 0
+      for (f = 0; f < 2; f++) { mean[f] = sum[f, b] / n; error += (squares[f, b] / n - mean[f] ^ 2) / (n - 1) }
+      # Where all pictures have the same, both are to have it.
+      if (error <= 0 && mean[0] == mean[1]) continue
+      z = error > 0 ? (mean[0] - mean[1]) / sqrt(error) : 99
+      if (z < 0) z = -z
+      if (z < 3) within++
+      if (z > most) most = z
+      blocks++; ours += mean[0]; peer += mean[1]
+    }
+    printf "track, %d pictures of %d² each: %d of %d blocks of 8² within 3 standard errors, the largest %.2f; all together %.5f times the peer\n",
+      n, side, within, blocks, most, ours / peer
+  }' "$out/ours.blocks" "$out/peer.blocks"

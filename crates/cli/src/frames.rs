@@ -7,7 +7,8 @@ use std::path::{Path, PathBuf};
 use nuage_pipeline::pack::unpack::unpack_frame;
 use nuage_pipeline::sequence::{FrameFile, FrameRange, find_frames};
 use nuage_vdb::{Compression, WriteOptions};
-use nuage_volume::format::Asset;
+use nuage_volume::format::{Asset, FormatError};
+use rayon::prelude::*;
 
 use crate::error::Failure;
 use crate::source::DiskFile;
@@ -86,6 +87,17 @@ pub(crate) fn check(path: &Path) -> Result<(), Failure> {
     checked.map_err(|error| Failure::file(path, error.to_string()))
 }
 
+/// Loads the pages that a frame needs, on all threads.
+///
+/// # Errors
+/// As those of [`Asset::load_frame`].
+fn load_frame(asset: &mut Asset, frame: usize) -> Result<(), FormatError> {
+    let pages = asset.pages_of_frame(frame)?;
+    let read = pages.into_par_iter().map(|page| Ok((page, asset.read_page(page)?)));
+    let read: Vec<(usize, Vec<u32>)> = read.collect::<Result<_, FormatError>>()?;
+    read.into_iter().try_for_each(|(page, words)| asset.set_page(page, words))
+}
+
 /// The bytes of a .vdb file that holds what a frame of a packed file holds.
 ///
 /// # Errors
@@ -100,7 +112,7 @@ pub(crate) fn as_vdb(path: &Path, wanted: Option<i64>) -> Result<Vec<u8>, Failur
             .find(|frame| number(&asset, *frame) == wanted)
             .ok_or_else(|| failed(format!("there is no frame {wanted}")))?,
     };
-    asset.load_frame(frame).map_err(|error| failed(error.to_string()))?;
+    load_frame(&mut asset, frame).map_err(|error| failed(error.to_string()))?;
     let (grids, metadata) = unpack_frame(&asset, frame).map_err(|error| failed(error.to_string()))?;
     let mut bytes = Vec::new();
     let options = WriteOptions { compression: Compression::NONE };
