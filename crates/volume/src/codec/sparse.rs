@@ -89,9 +89,7 @@ impl Coding {
             self.ends.map_or([0.0, 1.0], |ends| ends[octant].map(|end| f32::from(end) / LAST_END));
         (begin + (end - begin) * bent) * last(self.most_bits)
     }
-}
 
-impl Coding {
     /// Where bent codes stand, as a part of the way from the first to the last: the first are closer together than the last. Smoke that is
     /// thin is seen as well as what is dense and hides itself, so it should be told more exactly.
     #[inline]
