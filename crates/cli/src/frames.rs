@@ -87,15 +87,19 @@ pub(crate) fn check(path: &Path) -> Result<(), Failure> {
     checked.map_err(|error| Failure::file(path, error.to_string()))
 }
 
-/// Loads the pages that a frame needs, on all threads.
+/// Loads the pages that a frame needs, as far as they are absent, on all threads.
 ///
 /// # Errors
 /// As those of [`Asset::load_frame`].
-fn load_frame(asset: &mut Asset, frame: usize) -> Result<(), FormatError> {
-    let pages = asset.pages_of_frame(frame)?;
-    let read = pages.into_par_iter().map(|page| Ok((page, asset.read_page(page)?)));
-    let read: Vec<(usize, Vec<u32>)> = read.collect::<Result<_, FormatError>>()?;
-    read.into_iter().try_for_each(|(page, words)| asset.set_page(page, words))
+pub(crate) fn load_frame(asset: &mut Asset, frame: usize) -> Result<(), FormatError> {
+    let mut pages = asset.pages_of_frame(frame)?;
+    pages.retain(|page| asset.store().pages()[*page].words().is_none());
+    // A page for each thread at a time: what is read counts towards the limit of memory only once it is set.
+    for pages in pages.chunks(rayon::current_num_threads()) {
+        let read: Vec<_> = pages.par_iter().map(|page| asset.read_page(*page)).collect();
+        pages.iter().zip(read).try_for_each(|(page, words)| asset.set_page(*page, words?))?;
+    }
+    Ok(())
 }
 
 /// The bytes of a .vdb file that holds what a frame of a packed file holds.

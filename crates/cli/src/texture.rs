@@ -79,7 +79,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         return Err(failed("there is none of these frames".into()));
     }
     for frame in &wanted {
-        asset.load_frame(*frame).map_err(|error| failed(error.to_string()))?;
+        frames::load_frame(&mut asset, *frame).map_err(|error| failed(error.to_string()))?;
     }
     let options = Options {
         format: args.format,

@@ -17,6 +17,7 @@ use nuage_volume::format::{Asset, ChannelInfo, Role};
 
 use crate::convert;
 use crate::error::{Failure, explain};
+use crate::frames;
 use crate::source::{DiskFile, Memory};
 use crate::text::{number, one_line};
 
@@ -65,7 +66,7 @@ pub(crate) fn packed(
     let mut found = vec![Found::default(); asset.contents().channels.len()];
     for (i, frame) in frames.iter().enumerate() {
         let in_frame = |what: String| fail(format!("frame {}: {what}", frame.path.display()));
-        asset.load_frame(i).map_err(|error| in_frame(error.to_string()))?;
+        frames::load_frame(&mut asset, i).map_err(|error| in_frame(error.to_string()))?;
         let (grids, metadata) = unpack_frame(&asset, i).map_err(|error| in_frame(error.to_string()))?;
         let (sources, source_metadata) = convert::load(args, &frame.path)?;
         let channels: Vec<usize> =

@@ -337,12 +337,14 @@ fn paths_show_what_marching_shows_and_light_that_scatters_on() {
         let count = pixels.len() as f32;
         std::array::from_fn::<f32, 4, _>(|i| pixels.iter().map(|pixel| pixel[i]).sum::<f32>() / count)
     };
-    // The default of two voxels takes shadows to be 2 % lighter than they are.
-    let marched = mean("--samples 4 --shadow-step 1");
+    let marched = mean("--samples 4");
+    let finer = mean("--samples 4 --shadow-step 1");
     let once = mean("--integrator path --samples 64 --scatterings 1");
     let often = mean("--integrator path --samples 64");
     for i in 0..4 {
-        assert!((once[i] - marched[i]).abs() < 0.02 * marched[i], "{once:?} {marched:?}");
+        // Shadow steps of two voxels, the default, take shadows to be 2 % lighter than they are.
+        assert!((once[i] - marched[i]).abs() < 0.03 * marched[i], "{once:?} {marched:?}");
+        assert!((once[i] - finer[i]).abs() < 0.015 * finer[i], "{once:?} {finer:?}");
     }
     assert!((once[3] - often[3]).abs() < 0.01 * once[3], "{once:?} {often:?}");
     assert!(often[..3].iter().zip(&once).all(|(often, once)| *often > 1.2 * once), "{once:?} {often:?}");

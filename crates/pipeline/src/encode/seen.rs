@@ -6,6 +6,7 @@
 //! from these, one after the other is stepped up or down as long as less is seen, and what was left out of a
 //! brick comes back in its neighbours.
 
+use std::cell::OnceCell;
 use std::sync::LazyLock;
 
 use fearless_simd::{Simd, dispatch};
@@ -111,8 +112,8 @@ pub struct Seen<'a> {
     scale: &'a ChannelScale,
     /// What an error is multiplied by: the light there, in units of the channel.
     amplitude: Brick,
-    /// The ways to store it in [`Codec::Sparse`].
-    ways: Vec<Way>,
+    /// The ways to store it in [`Codec::Sparse`], found when they are first asked for: other codecs are written without them.
+    ways: OnceCell<Vec<Way>>,
 }
 
 /// Voxels that are kept: those whose magnitude is more than some value.
@@ -170,15 +171,18 @@ impl<'a> Seen<'a> {
     pub fn of(values: &'a Brick, scale: &'a ChannelScale, light: &Light) -> Self {
         let block = |voxel: usize| (voxel >> 7) << 4 | (voxel >> 4 & 3) << 2 | (voxel >> 1 & 3);
         let amplitude = std::array::from_fn(|voxel| light[block(voxel)] / scale.unit);
-        let mut seen = Seen { values, scale, amplitude, ways: Vec::new() };
-        if scale.background == 0.0 && values.iter().any(|value| *value != 0.0) {
-            seen.ways = seen.ways();
-        }
-        seen
+        Seen { values, scale, amplitude, ways: OnceCell::new() }
     }
 
     /// All ways, those that take the least words first.
-    fn ways(&self) -> Vec<Way> {
+    fn ways(&self) -> &[Way] {
+        self.ways.get_or_init(|| self.find_ways())
+    }
+
+    fn find_ways(&self) -> Vec<Way> {
+        if self.scale.background != 0.0 || self.values.iter().all(|value| *value == 0.0) {
+            return Vec::new();
+        }
         let largest = self.values.iter().fold(0.0_f32, |largest, value| largest.max(value.abs()));
         let doublings = self.doublings();
         let mut ways = Vec::new();
@@ -234,7 +238,7 @@ impl<'a> Seen<'a> {
     /// The sparse codecs to be tried, the cheapest first.
     pub fn codecs(&self) -> Vec<Codec> {
         let codec = |way: &Way| Codec::Sparse { is_fitted: false, pairs: way.pairs };
-        let mut codecs: Vec<Codec> = self.ways.iter().map(codec).collect();
+        let mut codecs: Vec<Codec> = self.ways().iter().map(codec).collect();
         codecs.dedup();
         codecs
     }
@@ -287,7 +291,7 @@ impl<'a> Seen<'a> {
 
     /// Of the ways that take so many words, and the lines, the one of which the least is likely to be seen.
     fn measured(&self, pairs: u8) -> Option<Measured> {
-        let ways = self.ways.iter().filter(|way| way.pairs == pairs);
+        let ways = self.ways().iter().filter(|way| way.pairs == pairs);
         let all = ways.flat_map(|way| SHORTENED.map(|part| self.measure(way, part)));
         let seen = |measured: &Measured| measured.error.squared + measured.error.bias;
         all.min_by(|a, b| seen(a).total_cmp(&seen(b)))
@@ -323,7 +327,7 @@ impl<'a> Seen<'a> {
             let lane = |of: [f32; 2]| -> [f32; ROW] { std::array::from_fn(|z| of[z / 4]) };
             let octants = [2 * quadrant, 2 * quadrant + 1];
             let last_codes = octants.map(|octant| (1_u32 << coding.bits[octant]) - 1);
-            let level = |i: usize, code: u32| line.low + line.step * coding.place(octants[i], code);
+            let level = |i: usize, code: u32| coding.value(line, octants[i], code);
             let (lows, highs) =
                 ([level(0, 0), level(1, 0)], [level(0, last_codes[0]), level(1, last_codes[1])]);
             let (last, low) = (lane(last_codes.map(|code| code as f32)), lane(lows));
@@ -460,8 +464,7 @@ impl<'a> Seen<'a> {
 
 /// The value of each code, by octant, as the decoder has it.
 fn levels(line: &StoredLine, coding: &Coding, floor: f32) -> [Vec<f32>; OCTANTS] {
-    let level =
-        |octant: usize, code: u32| (line.line.low + line.line.step * coding.place(octant, code)).max(floor);
+    let level = |octant: usize, code: u32| coding.value(line.line, octant, code).max(floor);
     std::array::from_fn(|octant| (0..1 << coding.bits[octant]).map(|code| level(octant, code)).collect())
 }
 

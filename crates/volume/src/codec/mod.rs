@@ -379,15 +379,10 @@ impl BrickContext<'_> {
                     }
                 };
                 let symbols = sparse::unpack(&coding, rest).ok_or(DecodeError::Sparse)?;
-                let is_plain = coding.is_even() && !coding.is_bent;
                 for (voxel, (value, symbol)) in out.iter_mut().zip(symbols).enumerate() {
-                    *value = match symbol {
-                        0 => 0.0,
-                        symbol if is_plain => *value + line.at(u32::from(symbol) - 1),
-                        symbol => {
-                            let place = coding.place(octant_of(voxel), u32::from(symbol) - 1);
-                            *value + (line.low + line.step * place)
-                        }
+                    *value = match u32::from(symbol).checked_sub(1) {
+                        None => 0.0,
+                        Some(code) => *value + coding.value(line, octant_of(voxel), code),
                     };
                 }
             }

@@ -7,6 +7,7 @@
 //! What is not a code is here a *symbol*: 0 for a voxel that is not there, else its code plus 1. What codes mean is
 //! [`super`]'s.
 
+use super::Line;
 use crate::space::BRICK_VOXELS;
 
 /// Codes have at most so many bits.
@@ -81,13 +82,22 @@ impl Coding {
     }
 
     /// Where on the line a code of an octant stands, as a count of the steps of codes of the most bits.
-    pub fn place(&self, octant: usize, code: u32) -> f32 {
+    fn place(&self, octant: usize, code: u32) -> f32 {
         let last = |bits: u8| ((1_u32 << bits) - 1) as f32;
         let part = code as f32 / last(self.bits[octant]);
         let bent = if self.is_bent { Coding::bent(part) } else { part };
         let [begin, end] =
             self.ends.map_or([0.0, 1.0], |ends| ends[octant].map(|end| f32::from(end) / LAST_END));
         (begin + (end - begin) * bent) * last(self.most_bits)
+    }
+
+    /// The value of a code of an octant on a line.
+    #[inline]
+    pub fn value(&self, line: Line, octant: usize, code: u32) -> f32 {
+        match self.is_even() && !self.is_bent {
+            true => line.at(code),
+            false => line.low + line.step * self.place(octant, code),
+        }
     }
 
     /// Where bent codes stand, as a part of the way from the first to the last: the first are closer together than the last. Smoke that is

@@ -46,6 +46,12 @@ impl Shape {
         let context = std::array::from_fn(|count| std::array::from_fn(|sum| mean(count, sum)));
         Shape { raw_bits, symbols, contexts: 2 * symbols, context }
     }
+
+    /// The context of a voxel by the neighbours of its row, its place there and the symbol before.
+    #[inline(always)]
+    fn context(&self, (before, count): &([u8; 8], usize), z: usize, last: u8) -> usize {
+        usize::from(self.context[count + usize::from(z > 0)][usize::from(before[z] + last)])
+    }
 }
 
 /// The bytes of the codes of some bricks, of 1 to 8 bits each.
@@ -59,12 +65,12 @@ pub(super) fn encode(bits: u8, bricks: &[Codes]) -> Vec<u8> {
             let symbols = codes.map(|code| code >> shape.raw_bits);
             let mut places = [0; BRICK_VOXELS];
             for row in 0..BRICK_VOXELS / 8 {
-                let (before, count) = neighbours(&symbols, row);
-                for i in 8 * row..8 * row + 8 {
-                    let (z, last) = (i % 8, if i % 8 > 0 { symbols[i - 1] } else { 0 });
-                    let context = shape.context[count + usize::from(z > 0)][usize::from(before[z] + last)];
-                    places[i] = u16::from(context) * shape.symbols as u16 + u16::from(symbols[i]);
-                    counts[usize::from(places[i])] += 1;
+                let (neighbours, mut last) = (neighbours(&symbols, row), 0);
+                for z in 0..8 {
+                    let i = 8 * row + z;
+                    let place = shape.context(&neighbours, z, last) * shape.symbols + usize::from(symbols[i]);
+                    counts[place] += 1;
+                    (places[i], last) = (place as u16, symbols[i]);
                 }
             }
             places
@@ -230,11 +236,10 @@ impl<'a> Decoder<'a> {
         let mut symbols: Box<[_; MAX_CONTEXTS]> = vec![[0; SCALE as usize]; MAX_CONTEXTS].try_into().ok()?;
         let mut ranges = Box::new([[0; 1 << SYMBOL_BITS]; MAX_CONTEXTS]);
         for context in 0..shape.contexts {
-            let mut start = 0;
-            for (symbol, frequency) in read_table(shape.symbols, &mut bytes)?.into_iter().enumerate() {
+            let table = read_table(shape.symbols, &mut bytes)?;
+            for (symbol, (frequency, start)) in table.iter().zip(starts(&table)).enumerate() {
                 symbols[context][start as usize..(start + frequency) as usize].fill(symbol as u8);
                 ranges[context][symbol] = frequency << 16 | start;
-                start += frequency;
             }
         }
         let words = bytes.as_chunks().0;
@@ -291,9 +296,7 @@ impl<'a> Decoder<'a> {
             let mut last = [0; N];
             for z in 0..8 {
                 for i in 0..N {
-                    let (before, count) = &neighbours[i];
-                    let contexts = &self.shape.context[count + usize::from(z > 0)];
-                    let context = usize::from(contexts[usize::from(before[z] + last[i])]);
+                    let context = self.shape.context(&neighbours[i], z, last[i]);
                     let part = states[i] & (SCALE - 1);
                     let symbol = self.symbols[context % MAX_CONTEXTS][part as usize];
                     let range = self.ranges[context % MAX_CONTEXTS][usize::from(symbol) % (1 << SYMBOL_BITS)];
