@@ -12,9 +12,9 @@ use std::time::Instant;
 use glam::{DVec2, DVec3};
 use nuage_pipeline::import::{import, import_surface};
 use nuage_render::camera::{Camera, Ray};
-use nuage_render::depth::{optical_depth, stepped_transmittance};
 use nuage_render::filter::Filter;
 use nuage_render::hash::{hash_pixel, hash_u32, unit_f32};
+use nuage_render::packet::{RAYS, optical_depths, stepped_transmittances};
 use nuage_render::surface::first_hit;
 use nuage_render::track::first_collision;
 use nuage_render::traverse::{Field, Reader};
@@ -25,6 +25,8 @@ use rayon::prelude::*;
 const EXTINCTION_PER_VOXEL: f64 = 0.1;
 const STEP_VOXELS: f32 = 0.5;
 const TILE: u32 = 16;
+/// Pixels of a packet along each axis.
+const SIDE: u32 = RAYS.isqrt() as u32;
 
 /// The channel of a file's first grid, and the value at its surface if it is a level set that is to be drawn.
 fn channel(path: &str, is_surface: bool) -> Result<(Channel, f32), Box<dyn Error>> {
@@ -37,25 +39,34 @@ fn channel(path: &str, is_surface: bool) -> Result<(Channel, f32), Box<dyn Error
     })
 }
 
-/// The picture of a kernel, row by row, and how many milliseconds it took.
-fn picture<'a, P: Send>(
+/// The values of a tile, packet by packet.
+type Tile = [f32; (TILE * TILE) as usize];
+
+/// The pixels of a packet of a tile.
+fn pixels_of(tile: u32, packet: u32, size: u32) -> [[u32; 2]; RAYS] {
+    let columns = size.div_ceil(TILE);
+    let (left, top) = (tile % columns * TILE, tile / columns * TILE);
+    let (left, top) = (left + packet % SIDE * SIDE, top + packet / SIDE * SIDE);
+    std::array::from_fn(|i| [left + i as u32 % SIDE, top + i as u32 / SIDE])
+}
+
+/// Makes the tiles of a picture. Gives how many milliseconds it took.
+fn picture<'a>(
     field: &Field<'a>,
     size: u32,
-    pixel: &(dyn Fn(&mut Reader<'a>, u32, u32) -> P + Sync),
-) -> (Vec<(u32, Vec<P>)>, f64) {
+    kernel: &(dyn Fn(&mut Reader<'a>, [[u32; 2]; RAYS]) -> [f32; RAYS] + Sync),
+    tiles: &mut [Tile],
+) -> f64 {
     let begin = Instant::now();
-    let columns = size.div_ceil(TILE);
-    let tiles = (0..columns * columns).into_par_iter().map_init(
+    tiles.par_iter_mut().enumerate().for_each_init(
         || field.reader(),
-        |reader, tile| {
-            let (left, top) = (tile % columns * TILE, tile / columns * TILE);
-            let (across, down) = (TILE.min(size - left), TILE.min(size - top));
-            let pixels = (0..across * down).map(|i| pixel(reader, left + i % across, top + i / across));
-            (tile, pixels.collect())
+        |reader, (tile, values)| {
+            for (packet, values) in (0..).zip(values.as_chunks_mut().0) {
+                *values = kernel(reader, pixels_of(tile as u32, packet, size));
+            }
         },
     );
-    let tiles = tiles.collect();
-    (tiles, begin.elapsed().as_secs_f64() * 1e3)
+    begin.elapsed().as_secs_f64() * 1e3
 }
 
 /// The time that all threads of this program were running, in milliseconds, where the system tells.
@@ -73,48 +84,44 @@ fn median(values: &mut [f64]) -> f64 {
     0.5 * (values[values.len() / 2] + values[(values.len() - 1) / 2])
 }
 
-/// What a kernel makes of a pixel.
-type Pixels<'r, 'a> = Box<dyn Fn(&mut Reader<'a>, u32, u32) -> f32 + Sync + 'r>;
+/// What a kernel makes of the pixels of a packet.
+type Kernel<'r, 'a> = Box<dyn Fn(&mut Reader<'a>, [[u32; 2]; RAYS]) -> [f32; RAYS] + Sync + 'r>;
 
-fn pixels_of<'r, 'a: 'r>(
+fn kernel_of<'r, 'a: 'r>(
     kernel: &str,
     field: &'r Field<'a>,
-    ray: impl Fn(u32, u32) -> Ray + Sync + 'r,
+    rays: impl Fn(&[[u32; 2]; RAYS]) -> [Ray; RAYS] + Sync + 'r,
     extinction: f32,
     voxel_size: f64,
     level: f32,
     seed: u32,
-) -> Result<Pixels<'r, 'a>, Box<dyn Error>> {
+) -> Result<Kernel<'r, 'a>, Box<dyn Error>> {
+    let filter = if matches!(kernel, "nearest" | "exact") { Filter::Nearest } else { Filter::Trilinear };
     Ok(match kernel {
-        "nearest" | "trilinear" => {
-            let filter = if kernel == "nearest" { Filter::Nearest } else { Filter::Trilinear };
-            Box::new(move |reader, x, y| {
-                1.0 - stepped_transmittance(field, reader, &ray(x, y), filter, STEP_VOXELS, extinction)
-            })
-        }
-        "exact" | "cubic" => {
-            let filter = if kernel == "exact" { Filter::Nearest } else { Filter::Trilinear };
-            Box::new(move |reader, x, y| {
-                1.0 - (-extinction * optical_depth(field, reader, &ray(x, y), filter)).exp()
-            })
-        }
-        "track" => Box::new(move |reader, x, y| {
+        "nearest" | "trilinear" => Box::new(move |reader, pixels| {
+            let passes = stepped_transmittances(field, reader, &rays(&pixels), filter, STEP_VOXELS, extinction);
+            passes.map(|passes| 1.0 - passes)
+        }),
+        "exact" | "cubic" => Box::new(move |reader, pixels| {
+            let depths = optical_depths(field, reader, &rays(&pixels), filter);
+            depths.map(|depth| 1.0 - (-extinction * depth).exp())
+        }),
+        "track" => Box::new(move |reader, pixels| std::array::from_fn(|i| { let [x, y] = pixels[i]; let ray = rays(&pixels)[i];
             let (path, mut count) = (hash_pixel(x, y, 0, hash_u32(seed)), 0_u32);
             let random = || {
                 count += 1;
                 unit_f32(hash_u32(path.wrapping_add(count)))
             };
-            f32::from(first_collision(field, reader, &ray(x, y), extinction, random).is_some())
-        }),
+            f32::from(first_collision(field, reader, &ray, extinction, random).is_some())
+        })),
         "surface" | "surface-shaded" => {
             let is_shaded = kernel == "surface-shaded";
-            Box::new(move |reader, x, y| {
-                let ray = ray(x, y);
+            Box::new(move |reader, pixels| rays(&pixels).map(|ray| {
                 first_hit(field, reader, &ray, level).map_or(0.0, |hit| match is_shaded {
                     true => hit.normal.dot(ray.direction.as_vec3()).abs(),
                     false => (hit.distance / voxel_size) as f32,
                 })
-            })
+            }))
         }
         _ => return Err(format!("no kernel '{kernel}'").into()),
     })
@@ -140,32 +147,33 @@ fn main() -> Result<(), Box<dyn Error>> {
     let camera = Camera::look_at(world(eye), world(target), DVec3::Y, 45.0).ok_or("no view")?;
     let voxel_size = channel.world_from_index.matrix3.x_axis.length();
     let extinction = (EXTINCTION_PER_VOXEL / voxel_size) as f32;
-    let ray = |x: u32, y: u32| -> Ray {
-        camera.ray(DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5), size, size)
+    let rays = |pixels: &[[u32; 2]; RAYS]| -> [Ray; RAYS] {
+        camera.rays(&pixels.map(|[x, y]| DVec2::new(x.into(), y.into()) + 0.5), size, size)
     };
-    let pixel = pixels_of(kernel, &field, ray, extinction, voxel_size, level, seed)?;
+    let kernel = kernel_of(kernel, &field, rays, extinction, voxel_size, level, seed)?;
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads.parse()?).build()?;
     let (mut times, mut cpu_times) = (Vec::new(), Vec::new());
-    let mut tiles = Vec::new();
+    let mut tiles = vec![[0.0; (TILE * TILE) as usize]; size.div_ceil(TILE).pow(2) as usize];
     for turn in 0..=repeats {
         let cpu = cpu_ms();
-        let (made, time) = pool.install(|| picture(&field, size, &*pixel));
+        let time = pool.install(|| picture(&field, size, &*kernel, &mut tiles));
         if turn > 0 {
             times.push(time);
             cpu_times.push(cpu_ms() - cpu);
         }
-        tiles = made;
     }
     if times.is_empty() {
         return Err("nothing was timed".into());
     }
     let mut values = vec![0.0_f32; size as usize * size as usize];
-    let columns = size.div_ceil(TILE);
-    for (tile, pixels) in tiles {
-        let (left, top) = (tile % columns * TILE, tile / columns * TILE);
-        let across = TILE.min(size - left);
-        for (i, value) in (0..).zip(pixels) {
-            values[((top + i / across) * size + left + i % across) as usize] = value;
+    for (tile, tile_values) in (0..).zip(&tiles) {
+        for (packet, packet_values) in (0..).zip(tile_values.as_chunks::<RAYS>().0) {
+            for ([x, y], value) in pixels_of(tile, packet, size).into_iter().zip(packet_values) {
+                // Tiles may reach over the edge.
+                if x < size && y < size {
+                    values[(y * size + x) as usize] = *value;
+                }
+            }
         }
     }
     let mean = values.iter().map(|v| f64::from(*v)).sum::<f64>() / values.len() as f64;

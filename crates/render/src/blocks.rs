@@ -99,6 +99,12 @@ impl<'a> Blocks<'a> {
         }
     }
 
+    /// The block of an entry, if it has been made.
+    #[inline(always)]
+    pub(crate) fn known(&self, entry: usize) -> Option<&Block> {
+        self.store.blocks.get(entry)?.get().map(AsRef::as_ref)
+    }
+
     /// The block of a brick that has no entry of its own, being part of a tile.
     #[cold]
     pub(crate) fn of_tile(&mut self, brick: IVec3) -> &Block {

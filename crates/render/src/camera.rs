@@ -2,7 +2,10 @@
 //!
 //! Right-handed, pinhole, looking along `forward`; image row 0 is at the top. The field of view is horizontal.
 
+use fearless_simd::{Simd, dispatch};
 use glam::{DVec2, DVec3};
+
+use crate::simd::level;
 
 /// A ray in world space.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -49,11 +52,52 @@ impl Camera {
         let direction = self.forward + x * self.right + y * self.up;
         Ray { origin: self.origin, direction: direction.normalize() }
     }
+
+    /// The rays of [`ray`](Self::ray) through several positions, in less time.
+    pub fn rays<const N: usize>(&self, pixels: &[DVec2; N], width: u32, height: u32) -> [Ray; N] {
+        dispatch!(level(), simd => simd.vectorize(
+            #[inline(always)]
+            || self.rays_by_axis(pixels, f64::from(width), f64::from(height))
+        ))
+    }
+
+    /// In loops that the compiler turns into vector instructions.
+    #[inline(always)]
+    fn rays_by_axis<const N: usize>(&self, pixels: &[DVec2; N], width: f64, height: f64) -> [Ray; N] {
+        let (mut direction, mut length) = ([[0.0; N]; 3], [0.0; N]);
+        for axis in 0..3 {
+            let (forward, right, up) = (self.forward[axis], self.right[axis], self.up[axis]);
+            for i in 0..N {
+                let x = (2.0 * pixels[i].x / width - 1.0) * self.half_width_tangent;
+                let y = (height - 2.0 * pixels[i].y) / width * self.half_width_tangent;
+                let along = forward + x * right + y * up;
+                direction[axis][i] = along;
+                length[i] += along * along;
+            }
+        }
+        for length in &mut length {
+            *length = 1.0 / length.sqrt();
+        }
+        let mut rays = [Ray { origin: self.origin, direction: self.forward }; N];
+        for (i, ray) in rays.iter_mut().enumerate() {
+            let [x, y, z] = direction;
+            ray.direction = DVec3::new(x[i], y[i], z[i]) * length[i];
+        }
+        rays
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn rays_together_are_those_one_by_one() {
+        let camera = Camera::look_at(DVec3::new(3.0, 1.0, 7.0), DVec3::X, DVec3::Y, 70.0).unwrap();
+        let pixels: [DVec2; 16] = std::array::from_fn(|i| DVec2::new(i as f64 * 3.7, 90.0 - i as f64));
+        let together = camera.rays(&pixels, 64, 100);
+        assert_eq!(together, pixels.map(|pixel| camera.ray(pixel, 64, 100)));
+    }
 
     #[test]
     fn the_horizontal_field_of_view_spans_the_width() {

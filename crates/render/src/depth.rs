@@ -7,7 +7,9 @@
 //! Eight samples of a ray are taken at once. Light that scatters is followed in [`march`](crate::march) and
 //! [`path`](crate::path).
 
-use fearless_simd::{Level, Simd, dispatch, f32x4, f32x8, i32x8, prelude::*, u32x8, u64x2};
+use fearless_simd::{
+    Level, Simd, dispatch, f32x4, f32x8, f32x16, i32x8, i32x16, prelude::*, u32x8, u32x16, u64x2,
+};
 use glam::Vec3;
 use nuage_volume::brick::Bricks;
 use nuage_volume::space::BRICK_VOXELS;
@@ -15,6 +17,7 @@ use nuage_volume::space::BRICK_VOXELS;
 use crate::blocks::{Block, Blocks, SIDE};
 use crate::camera::Ray;
 use crate::filter::Filter;
+use crate::gather::{gather_f32, gather_u16};
 use crate::simd::{each_lane, level};
 use crate::traverse::{Field, LocalRay, Reader};
 use crate::walk::{BrickSpan, Sight, Slabs, SortedRay, SpanContent, Spans, with_spans};
@@ -319,10 +322,16 @@ fn voxel_slabs<S: Simd>(simd: S, ray: &SortedRay, span: &BrickSpan) -> Slabs<S> 
     Slabs::of(simd, &ray.seen_from(span.corner), first, [span.t0, span.t1], LAST_CELL_END)
 }
 
+/// From the exponents of half floats to those of floats.
+const TWO_POW_112: f32 = f32::from_bits((127 + 112) << 23);
+
 /// A value as [`Bricks`] store it.
-trait Stored: Copy + Default {
+pub(crate) trait Stored: Copy + Default {
     /// The numbers that eight of them stand for.
     fn widen<S: Simd>(simd: S, values: [Self; 8]) -> f32x8<S>;
+
+    /// The numbers at places of a slice; 0 outside of it.
+    fn gather<S: Simd>(simd: S, values: &[Self], at: i32x16<S>) -> f32x16<S>;
 }
 
 impl Stored for f32 {
@@ -330,16 +339,27 @@ impl Stored for f32 {
     fn widen<S: Simd>(simd: S, values: [f32; 8]) -> f32x8<S> {
         f32x8::simd_from(simd, values)
     }
+
+    #[inline(always)]
+    fn gather<S: Simd>(simd: S, values: &[f32], at: i32x16<S>) -> f32x16<S> {
+        gather_f32(simd, values, at)
+    }
 }
 
 impl Stored for u16 {
     /// What `f32_from_finite_f16` does, in lanes.
     #[inline(always)]
     fn widen<S: Simd>(simd: S, values: [u16; 8]) -> f32x8<S> {
-        const TWO_POW_112: f32 = f32::from_bits((127 + 112) << 23);
         let bits = u32x8::simd_from(simd, each_lane!(|lane| u32::from(values[lane])));
         let magnitude = ((bits & 0x7fff) << 13).bitcast::<f32x8<S>>() * TWO_POW_112;
         (magnitude.bitcast::<u32x8<S>>() | ((bits & 0x8000) << 16)).bitcast()
+    }
+
+    #[inline(always)]
+    fn gather<S: Simd>(simd: S, values: &[u16], at: i32x16<S>) -> f32x16<S> {
+        let bits = gather_u16(simd, values, at);
+        let magnitude = ((bits & 0x7fff) << 13).bitcast::<f32x16<S>>() * TWO_POW_112;
+        (magnitude.bitcast::<u32x16<S>>() | ((bits & 0x8000) << 16)).bitcast()
     }
 }
 
@@ -423,14 +443,14 @@ impl Crossings {
 }
 
 /// What stands where a block has no value, should rounding lead there.
-const NOWHERE: [f32; CORNERS_SPAN] = [0.0; CORNERS_SPAN];
+pub(crate) const NOWHERE: [f32; CORNERS_SPAN] = [0.0; CORNERS_SPAN];
 
 /// The eight corners of a cell lie in as many consecutive values of a block: one bounds check.
-const CORNERS_SPAN: usize = SIDE * SIDE + SIDE + 2;
+pub(crate) const CORNERS_SPAN: usize = SIDE * SIDE + SIDE + 2;
 
 /// The values from the first to the last corner of the cell at an offset of a block.
 #[inline(always)]
-fn corners_from(block: &Block, offset: usize) -> &[f32; CORNERS_SPAN] {
+pub(crate) fn corners_from(block: &Block, offset: usize) -> &[f32; CORNERS_SPAN] {
     match block.get(offset..).and_then(|values| values.first_chunk()) {
         Some(values) => values,
         None => &NOWHERE,
@@ -463,6 +483,33 @@ pub(crate) fn interpolate(block: &Block, position: Vec3) -> f32 {
 fn mix<S: Simd>(a: f32x8<S>, b: f32x8<S>, t: f32x8<S>) -> f32x8<S> {
     a + (b - a) * t
 }
+
+/// The mean of the interpolation between eight corners along a line inside their cell, whose middle is at fractions of the cell
+/// and which goes a way along each axis.
+///
+/// Along the line the interpolation is a cubic. With d the way from end to end in voxels, its mean is the value in the
+/// middle and a twelfth of the sum, over pairs of axes, of the mixed derivative there times d along both: the mean of
+/// `xyz` over a line through `m` is `mx my mz + (mx dy dz + my dx dz + mz dx dy) / 12`, and likewise for `xy`.
+///
+/// A macro, for vectors of eight and of sixteen lanes have no type in common.
+macro_rules! mean_in_cell {
+    ($corners:expr, $middle:expr, $way:expr) => {{
+        let (c, [x, y, z], [dx, dy, dz]) = ($corners, $middle, $way);
+        // Along z: values and slopes of the four edges; then along y, then along x.
+        let (e0, e1, e2, e3) = (c[1] - c[0], c[3] - c[2], c[5] - c[4], c[7] - c[6]);
+        let (v0, v1, v2, v3) = (c[0] + e0 * z, c[2] + e1 * z, c[4] + e2 * z, c[6] + e3 * z);
+        let (y0, y1) = (v1 - v0, v3 - v2);
+        let (low, high) = (v0 + y0 * y, v2 + y1 * y);
+        let (s0, s1) = (e1 - e0, e3 - e2);
+        let value = low + (high - low) * x;
+        let yz = s0 + (s1 - s0) * x;
+        let xz = (e2 + s1 * y) - (e0 + s0 * y);
+        let xy = y1 - y0;
+        let mixed = xy * (dx * dy) + xz * (dx * dz) + yz * (dy * dz);
+        value + mixed * (1.0 / 12.0)
+    }};
+}
+pub(crate) use mean_in_cell;
 
 /// A ray in voxels from the first corner of a brick, in each lane.
 pub(crate) struct BrickRay<S: Simd> {
@@ -528,27 +575,13 @@ impl<S: Simd> BrickRay<S> {
     }
 
     /// The integrals of the interpolation over stretches inside one cell each.
-    ///
-    /// Along the stretch the interpolation is a cubic. With d the way from end to end in voxels, its mean is the value in the
-    /// middle and a twelfth of the sum, over pairs of axes, of the mixed derivative there times d along both: the mean of
-    /// `xyz` over a line through `m` is `mx my mz + (mx dy dz + my dx dz + mz dx dy) / 12`, and likewise for `xy`.
     #[inline(always)]
     fn integral(&self, block: &Block, t0: f32x8<S>, t1: f32x8<S>) -> f32x8<S> {
         let (offsets, [x, y, z]) = self.cells((t0 + t1) * 0.5);
         let c = self.corners(block, offsets);
         let length = t1 - t0;
         let (dx, dy, dz) = (length * self.direction.x, length * self.direction.y, length * self.direction.z);
-        // Along z: values and slopes of the four edges; then along y, then along x.
-        let (e0, e1, e2, e3) = (c[1] - c[0], c[3] - c[2], c[5] - c[4], c[7] - c[6]);
-        let (v0, v1, v2, v3) = (c[0] + e0 * z, c[2] + e1 * z, c[4] + e2 * z, c[6] + e3 * z);
-        let (y0, y1) = (v1 - v0, v3 - v2);
-        let (low, high) = (v0 + y0 * y, v2 + y1 * y);
-        let value = mix(low, high, x);
-        let yz = mix(e1 - e0, e3 - e2, x);
-        let xz = mix(e2, e3, y) - mix(e0, e1, y);
-        let xy = y1 - y0;
-        let mixed = xy * (dx * dy) + xz * (dx * dz) + yz * (dy * dz);
-        (value + mixed * (1.0 / 12.0)) * length
+        mean_in_cell!(c, [x, y, z], [dx, dy, dz]) * length
     }
 }
 

@@ -12,8 +12,6 @@
 //!
 //! What does not live here: files, sequences, the import of grids and the program.
 
-#![forbid(unsafe_code)]
-
 pub mod blocks;
 pub mod camera;
 pub mod checkpoint;
@@ -23,11 +21,13 @@ pub mod envmap;
 pub mod film;
 pub mod filter;
 pub mod framing;
+mod gather;
 pub mod hash;
 pub mod light;
 pub mod march;
 pub mod math;
 pub mod output;
+pub mod packet;
 pub mod path;
 pub mod phase;
 pub mod picture;

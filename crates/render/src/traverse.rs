@@ -136,6 +136,12 @@ impl<'a> Field<'a> {
         self.maps[sight as usize].get_or_init(make).as_ref()
     }
 
+    /// The same for kernels over packets of rays, which know of no bricks that blend with tiles.
+    #[inline]
+    pub(crate) fn packet_map(&self, sight: Sight) -> Option<&BrickMap> {
+        self.map(sight).filter(|map| map.is_plain())
+    }
+
     /// The brick whose first voxel is at a position of the walk.
     pub(crate) fn brick_at(&self, corner: Vec3) -> IVec3 {
         (corner * 0.125).as_ivec3().wrapping_add(self.base_brick)
@@ -180,6 +186,12 @@ impl<'a> Field<'a> {
             shadow_walker: Accessor::new(&self.channel.tree),
             blocks: Blocks::new(&self.channel.tree, &self.blocks),
         }
+    }
+
+    /// What takes directions of the world to positions of the walk, where the world's origin is there, and between what positions
+    /// samples can be other than zero.
+    pub(crate) fn placement(&self) -> (DMat3, DVec3, [DVec3; 2]) {
+        (self.index_from_world, self.offset, self.bounds)
     }
 
     /// Where a ray enters and leaves the field, as distances from its origin.

@@ -24,7 +24,7 @@ const MOST_CELLS: i64 = 1 << 22;
 const LEAST_LEAP: i32 = 4;
 
 /// Cells of a map from here on are indices of contents of other kinds than a brick's.
-const SPECIAL: i32 = 1 << 30;
+pub(crate) const SPECIAL: i32 = 1 << 30;
 /// The furthest that is told of an empty brick.
 const FURTHEST: u8 = 255;
 
@@ -121,6 +121,8 @@ pub(crate) struct BrickMap {
     cells: Box<[i32]>,
     size: IVec3,
     specials: Vec<SpanContent>,
+    /// The values of special cells, if that is all that they are.
+    constants: Option<Box<[f32]>>,
 }
 
 impl BrickMap {
@@ -168,12 +170,35 @@ impl BrickMap {
                 *cell = -i32::from(distance);
             }
         }
-        Some(BrickMap { cells: cells.into(), size, specials })
+        let constants = specials.iter().map(|content| match content {
+            SpanContent::Constant(value) => Some(*value),
+            _ => None,
+        });
+        let constants = constants.collect();
+        Some(BrickMap { cells: cells.into(), size, specials, constants })
     }
 
     /// How far apart neighbours along each axis are.
-    fn strides(&self) -> [i32; 3] {
+    pub(crate) fn strides(&self) -> [i32; 3] {
         [self.size.y * self.size.z, self.size.z, 1]
+    }
+
+    /// Whether each cell is empty, a brick or of one value.
+    #[inline(always)]
+    pub(crate) fn is_plain(&self) -> bool {
+        self.constants.is_some()
+    }
+
+    /// The values of the cells from [`SPECIAL`] on, if all of these have one.
+    #[inline(always)]
+    pub(crate) fn constants(&self) -> &[f32] {
+        self.constants.as_deref().unwrap_or_default()
+    }
+
+    /// All cells: below 0 as far away as the nearest brick that is not empty, from [`SPECIAL`] on special ones, else bricks.
+    #[inline(always)]
+    pub(crate) fn cells(&self) -> &[i32] {
+        &self.cells
     }
 
     #[inline(always)]

@@ -1,0 +1,243 @@
+//! Line integrals along the rays of a packet: what [`depth`](crate::depth) gives for each of them.
+
+use fearless_simd::{Level, Simd, dispatch, f32x16, i32x16, prelude::*};
+use nuage_volume::brick::Bricks;
+
+use super::{Lanes, Packet, RAYS, bricks_of, each_ray, interpolate, to_int, trunc};
+use crate::camera::Ray;
+use crate::depth::{self, NEAREST_SHIFT, Stored};
+use crate::filter::Filter;
+use crate::gather::{gather_f32, prefetch};
+use crate::simd::level;
+use crate::traverse::{Field, Reader};
+use crate::walk::{SPECIAL, Sight};
+
+/// The integral of a field along each ray: [`optical_depth`](depth::optical_depth) of it.
+pub fn optical_depths<'a>(
+    field: &Field<'a>,
+    reader: &mut Reader<'a>,
+    rays: &[Ray; RAYS],
+    filter: Filter,
+) -> [f32; RAYS] {
+    optical_depths_at(level(), field, reader, rays, filter)
+}
+
+/// The share of light that passes along each ray: [`stepped_transmittance`](depth::stepped_transmittance) of it.
+pub fn stepped_transmittances<'a>(
+    field: &Field<'a>,
+    reader: &mut Reader<'a>,
+    rays: &[Ray; RAYS],
+    filter: Filter,
+    step_voxels: f32,
+    extinction: f32,
+) -> [f32; RAYS] {
+    stepped_transmittances_at(level(), field, reader, rays, filter, step_voxels, extinction)
+}
+
+fn optical_depths_at<'a>(
+    level: Level,
+    field: &Field<'a>,
+    reader: &mut Reader<'a>,
+    rays: &[Ray; RAYS],
+    filter: Filter,
+) -> [f32; RAYS] {
+    let (sight, shift) = sight_of(filter);
+    let Some(map) = field.packet_map(sight) else {
+        return each_ray!(|lane| depth::optical_depth_at(level, field, reader, &rays[lane], filter));
+    };
+    dispatch!(level, simd => simd.vectorize(
+        #[inline(always)]
+        || {
+            let Some(packet) = Packet::enter(field, rays, shift, None) else { return [0.0; RAYS] };
+            let lanes = Lanes::new(simd, map, &packet);
+            match (filter, &field.tree().bricks) {
+                (Filter::Nearest, Bricks::F32(values)) => integrate_voxels(&lanes, values),
+                (Filter::Nearest, Bricks::F16(values)) => integrate_voxels(&lanes, values),
+                (Filter::Trilinear, _) => integrate_cells(&lanes, field, reader),
+            }
+        }
+    ))
+}
+
+fn stepped_transmittances_at<'a>(
+    level: Level,
+    field: &Field<'a>,
+    reader: &mut Reader<'a>,
+    rays: &[Ray; RAYS],
+    filter: Filter,
+    step_voxels: f32,
+    extinction: f32,
+) -> [f32; RAYS] {
+    let (sight, shift) = sight_of(filter);
+    let Some(map) = field.packet_map(sight) else {
+        return each_ray!(|lane| {
+            depth::stepped_transmittance_at(level, field, reader, &rays[lane], filter, step_voxels, extinction)
+        });
+    };
+    dispatch!(level, simd => simd.vectorize(
+        #[inline(always)]
+        || {
+            let Some(packet) = Packet::enter(field, rays, shift, Some(step_voxels)) else { return [1.0; RAYS] };
+            let lanes = Lanes::new(simd, map, &packet);
+            let steps = f32x16::simd_from(simd, each_ray!(|lane| packet.steps[lane] as f32));
+            match (filter, &field.tree().bricks) {
+                (Filter::Nearest, Bricks::F32(values)) => step_voxels_of(&lanes, values, steps, extinction),
+                (Filter::Nearest, Bricks::F16(values)) => step_voxels_of(&lanes, values, steps, extinction),
+                (Filter::Trilinear, _) => step_cells(&lanes, field, reader, steps, extinction),
+            }
+        }
+    ))
+}
+
+fn sight_of(filter: Filter) -> (Sight, f64) {
+    match filter {
+        Filter::Nearest => (Sight::Voxels, NEAREST_SHIFT),
+        Filter::Trilinear => (Sight::Cells, 0.0),
+    }
+}
+
+/// The values of voxels in bricks; those of special cells of the map; 0 where cells are empty.
+#[inline(always)]
+fn values_of<S: Simd, V: Stored>(
+    lanes: &Lanes<'_, S>,
+    values: &[V],
+    cells: i32x16<S>,
+    voxels: [i32x16<S>; 3],
+) -> f32x16<S> {
+    let simd = lanes.simd;
+    let found = V::gather(simd, values, places_of(simd, cells, voxels));
+    with_specials(lanes, cells, found)
+}
+
+/// The places of voxels in the values of all bricks; beyond all where cells hold no brick.
+#[inline(always)]
+fn places_of<S: Simd>(simd: S, cells: i32x16<S>, voxels: [i32x16<S>; 3]) -> i32x16<S> {
+    let offsets = ((voxels[0] & 7) << 6) | ((voxels[1] & 7) << 3) | (voxels[2] & 7);
+    let holds_brick = cells.simd_ge(0) & cells.simd_lt(SPECIAL);
+    holds_brick.select((cells << 9) | offsets, i32x16::splat(simd, -1))
+}
+
+#[inline(always)]
+fn look_ahead<S: Simd, V>(lanes: &Lanes<'_, S>, values: &[V], t: f32x16<S>) {
+    let positions = lanes.at(t);
+    let cells = lanes.cells(bricks_of(positions), t.simd_lt(lanes.ends));
+    prefetch(values, places_of(lanes.simd, cells, to_int(positions)));
+}
+
+/// The values of special cells in their lanes.
+#[inline(always)]
+fn with_specials<S: Simd>(lanes: &Lanes<'_, S>, cells: i32x16<S>, others: f32x16<S>) -> f32x16<S> {
+    let is_special = cells.simd_ge(SPECIAL);
+    match is_special.any_true() {
+        true => is_special.select(gather_f32(lanes.simd, lanes.map.constants(), cells - SPECIAL), others),
+        false => others,
+    }
+}
+
+#[inline(always)]
+fn integrate_voxels<S: Simd, V: Stored>(lanes: &Lanes<'_, S>, values: &[V]) -> [f32; RAYS] {
+    let (mut t, mut depth) = (lanes.splat(0.0), lanes.splat(0.0));
+    let mut voxels = trunc(lanes.at(t));
+    loop {
+        let active = t.simd_lt(lanes.ends);
+        if !active.any_true() {
+            return depth.to_array();
+        }
+        let cells = lanes.cells(bricks_of(voxels), active);
+        let step = lanes.step(voxels, cells, active, t);
+        let value = values_of(lanes, values, cells, to_int(voxels));
+        // Those that have left stand in an empty cell.
+        depth += value * (step.t.min(lanes.ends) - t);
+        (t, voxels) = (step.t, step.behind);
+    }
+}
+
+#[inline(always)]
+fn integrate_cells<'a, S: Simd>(lanes: &Lanes<'_, S>, field: &Field<'a>, reader: &mut Reader<'a>) -> [f32; RAYS] {
+    let (mut t, mut depth) = (lanes.splat(0.0), lanes.splat(0.0));
+    let mut voxels = trunc(lanes.at(t));
+    loop {
+        let active = t.simd_lt(lanes.ends);
+        if !active.any_true() {
+            return depth.to_array();
+        }
+        let cells = lanes.cells(bricks_of(voxels), active);
+        let step = lanes.step(voxels, cells, active, t);
+        let end = step.t.min(lanes.ends);
+        let length = end - t;
+        if (cells.simd_ge(0) & active).any_true() {
+            let corners = lanes.corners(field, &mut reader.blocks, cells, to_int(voxels));
+            let middle = lanes.at((t + end) * 0.5);
+            let along = |axis: usize| (middle[axis] - voxels[axis], lanes.direction[axis] * length);
+            let ((x, dx), (y, dy), (z, dz)) = (along(0), along(1), along(2));
+            let mean = depth::mean_in_cell!(corners, [x, y, z], [dx, dy, dz]);
+            depth += with_specials(lanes, cells, mean) * length;
+        }
+        (t, voxels) = (step.t, step.behind);
+    }
+}
+
+#[inline(always)]
+fn step_voxels_of<S: Simd, V: Stored>(
+    lanes: &Lanes<'_, S>,
+    values: &[V],
+    steps: f32x16<S>,
+    extinction: f32,
+) -> [f32; RAYS] {
+    each_step(lanes, steps, extinction, |cells, positions, t, i| {
+        if i & 7 == 0 {
+            look_ahead(lanes, values, t + steps * 16.0);
+        }
+        values_of(lanes, values, cells, to_int(positions))
+    })
+}
+
+#[inline(always)]
+fn step_cells<'a, S: Simd>(
+    lanes: &Lanes<'_, S>,
+    field: &Field<'a>,
+    reader: &mut Reader<'a>,
+    steps: f32x16<S>,
+    extinction: f32,
+) -> [f32; RAYS] {
+    each_step(lanes, steps, extinction, |cells, positions, _, _| {
+        let voxels = trunc(positions);
+        let corners = lanes.corners(field, &mut reader.blocks, cells, to_int(voxels));
+        let along = |axis: usize| positions[axis] - voxels[axis];
+        with_specials(lanes, cells, interpolate(corners, [along(0), along(1), along(2)]))
+    })
+}
+
+/// Multiplies what passes each step, `value` giving the values of cells of the map at positions.
+#[inline(always)]
+fn each_step<S: Simd>(
+    lanes: &Lanes<'_, S>,
+    steps: f32x16<S>,
+    extinction: f32,
+    mut value: impl FnMut(i32x16<S>, [f32x16<S>; 3], f32x16<S>, u32) -> f32x16<S>,
+) -> [f32; RAYS] {
+    let (one, per_step, loss) = (lanes.splat(1.0), lanes.splat(1.0) / steps, steps * extinction);
+    let mut i = 0;
+    let (mut number, mut passes) = (lanes.splat(0.0), one);
+    loop {
+        let t = number * steps;
+        let active = t.simd_lt(lanes.ends);
+        if !active.any_true() {
+            return passes.to_array();
+        }
+        let positions = lanes.at(t);
+        let bricks = bricks_of(positions);
+        let cells = lanes.cells(bricks, active);
+        let is_empty = cells.simd_lt(0);
+        number += one;
+        i += 1;
+        if !(is_empty & active).all_true() {
+            passes *= one - value(cells, positions, t, i) * loss;
+        }
+        if (is_empty & active).any_true() {
+            let leaving = lanes.leave_bricks(bricks, lanes.beyond(cells), t);
+            let next = (leaving * per_step).ceil().max(number);
+            number = is_empty.select(next, number);
+        }
+    }
+}

@@ -1,0 +1,367 @@
+//! Rays of neighbouring pixels, sixteen at once: a lane each, in one order of steps for all.
+//!
+//! A kernel over single rays ([`depth`](crate::depth), [`track`](crate::track), [`surface`](crate::surface)) spends most of
+//! its time on getting from one brick to the next, and its lanes are half empty where a ray leaves a brick. Here each lane is
+//! a ray of its own that goes from box to box: a voxel where there are some, and where there are none as many bricks as its
+//! [`BrickMap`] says are empty. No lane waits for another, so that rays need not have anything in common; but those that do
+//! find their values in the same lines of the cache.
+//!
+//! Nothing is shared between lanes, so each ray's result is the same in any company and on any vector instructions. What the
+//! kernels over single rays give is the specification, and what fields without a map, or rays of which there are few, use.
+
+use fearless_simd::{Simd, f32x16, i32x16, mask32x16, prelude::*};
+use glam::IVec3;
+
+use crate::blocks::Blocks;
+use crate::camera::Ray;
+use crate::gather::gather_i32;
+use crate::depth::{NOWHERE, corners_from};
+use crate::traverse::Field;
+use crate::walk::{BrickMap, SPECIAL};
+
+mod lines;
+
+pub use lines::{optical_depths, stepped_transmittances};
+
+/// Rays of a packet.
+pub const RAYS: usize = 16;
+
+/// An array of what an expression gives for each ray of a packet; see `each_lane`.
+macro_rules! each_ray {
+    (|$lane:ident| $value:expr) => {
+        each_ray!(@ $lane, $value, 0 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15)
+    };
+    (@ $lane:ident, $value:expr, $($number:literal)*) => {
+        [$({ let $lane: usize = $number; $value }),*]
+    };
+}
+pub(crate) use each_ray;
+
+/// The rays of a packet in the positions of a field, t = 0 being where each enters it. Coordinates come by axis, then by ray.
+struct Packet {
+    origin: [[f32; RAYS]; 3],
+    direction: [[f32; RAYS]; 3],
+    inverse: [[f32; RAYS]; 3],
+    /// Where t is 0, as a distance from the ray's origin.
+    starts: [f64; RAYS],
+    /// Where each leaves the field; not above 0 if it misses.
+    ends: [f32; RAYS],
+    /// The steps asked for in world lengths.
+    steps: [f64; RAYS],
+}
+
+impl Packet {
+    /// `None` if all rays miss. With a step, in voxels, t = 0 is the first whole multiple of it from the ray's origin on.
+    ///
+    /// What [`Field::enter`] does, in loops over lanes without branches.
+    #[inline(always)]
+    fn enter(field: &Field<'_>, rays: &[Ray; RAYS], shift_voxels: f64, step_voxels: Option<f32>) -> Option<Packet> {
+        let (index_from_world, offset, [low, high]) = field.placement();
+        let by_rows = index_from_world.transpose();
+        let [mut origin, mut direction, mut inverse] = [[[0.0_f64; RAYS]; 3]; 3];
+        let (mut starts, mut ends) = ([0.0_f64; RAYS], [f64::INFINITY; RAYS]);
+        for axis in 0..3 {
+            let (row, offset) = (by_rows.col(axis), offset[axis] + shift_voxels);
+            let (low, high) = (low[axis], high[axis]);
+            for lane in 0..RAYS {
+                let ray = &rays[lane];
+                let o = row.x * ray.origin.x + row.y * ray.origin.y + row.z * ray.origin.z + offset;
+                let d = row.x * ray.direction.x + row.y * ray.direction.y + row.z * ray.direction.z;
+                let i = 1.0 / d;
+                let (to_low, to_high) = ((low - o) * i, (high - o) * i);
+                let (near, far) = if to_low < to_high { (to_low, to_high) } else { (to_high, to_low) };
+                // Along an axis along which nothing moves a ray is inside for ever or never.
+                let aside = if o >= low && o <= high { f64::INFINITY } else { f64::NEG_INFINITY };
+                let (near, far) = if d == 0.0 { (-aside, aside) } else { (near, far) };
+                starts[lane] = if near > starts[lane] { near } else { starts[lane] };
+                ends[lane] = if far < ends[lane] { far } else { ends[lane] };
+                (origin[axis][lane], direction[axis][lane], inverse[axis][lane]) = (o, d, i);
+            }
+        }
+        let mut any = false;
+        for lane in 0..RAYS {
+            let is_hit = starts[lane] < ends[lane];
+            any |= is_hit;
+            // Numbers without sense, such as infinite ones, are no place to begin.
+            (starts[lane], ends[lane]) = if is_hit { (starts[lane], ends[lane]) } else { (0.0, 0.0) };
+        }
+        if !any {
+            return None;
+        }
+        let mut steps = [0.0; RAYS];
+        if let Some(step_voxels) = step_voxels {
+            for lane in 0..RAYS {
+                let [x, y, z] = [direction[0][lane], direction[1][lane], direction[2][lane]];
+                steps[lane] = f64::from(step_voxels) / (x * x + y * y + z * z).sqrt();
+                starts[lane] = (starts[lane] / steps[lane]).ceil() * steps[lane];
+            }
+        }
+        let mut packet = Packet {
+            origin: [[0.0; RAYS]; 3],
+            direction: [[0.0; RAYS]; 3],
+            inverse: [[0.0; RAYS]; 3],
+            starts,
+            ends: [0.0; RAYS],
+            steps,
+        };
+        for axis in 0..3 {
+            for lane in 0..RAYS {
+                let d = direction[axis][lane];
+                packet.origin[axis][lane] = (origin[axis][lane] + d * starts[lane]) as f32;
+                packet.direction[axis][lane] = d as f32;
+                // An axis along which nothing moves is never the first to meet a face, be its zero negative.
+                let inverse = inverse[axis][lane] as f32;
+                let inverse = if inverse > f32::MIN { inverse } else { f32::MAX };
+                packet.inverse[axis][lane] = if inverse < f32::MAX { inverse } else { f32::MAX };
+            }
+        }
+        for lane in 0..RAYS {
+            packet.ends[lane] = (ends[lane] - starts[lane]) as f32;
+        }
+        Some(packet)
+    }
+}
+
+/// The rays of a packet in lanes, on their way through a map of bricks.
+struct Lanes<'m, S: Simd> {
+    simd: S,
+    map: &'m BrickMap,
+    /// How far apart neighbours along each axis are in the map.
+    strides: [f32; 3],
+    origin: [f32x16<S>; 3],
+    direction: [f32x16<S>; 3],
+    inverse: [f32x16<S>; 3],
+    /// 1 along an axis along which the ray grows, else 0; and 1 or -1.
+    forward: [f32x16<S>; 3],
+    sign: [f32x16<S>; 3],
+    /// Where each ray leaves the field.
+    ends: f32x16<S>,
+}
+
+/// A step of a ray out of the box it is in.
+struct Step<S: Simd> {
+    /// Where it leaves the box.
+    t: f32x16<S>,
+    /// The place behind, along each axis.
+    behind: [f32x16<S>; 3],
+}
+
+/// The box that a ray is to leave next.
+struct Leaving<S: Simd> {
+    /// Along each axis, the face towards which the ray goes.
+    faces: [f32x16<S>; 3],
+    /// Where the ray meets each.
+    t_faces: [f32x16<S>; 3],
+    /// Where it leaves the box.
+    t: f32x16<S>,
+}
+
+impl<'m, S: Simd> Lanes<'m, S> {
+    #[inline(always)]
+    fn new(simd: S, map: &'m BrickMap, packet: &Packet) -> Self {
+        let (zero, one) = (f32x16::splat(simd, 0.0), f32x16::splat(simd, 1.0));
+        let load = |values: &[[f32; RAYS]; 3]| {
+            [
+                f32x16::simd_from(simd, values[0]),
+                f32x16::simd_from(simd, values[1]),
+                f32x16::simd_from(simd, values[2]),
+            ]
+        };
+        let direction = load(&packet.direction);
+        let is_forward = [direction[0].simd_ge(zero), direction[1].simd_ge(zero), direction[2].simd_ge(zero)];
+        Lanes {
+            simd,
+            map,
+            strides: map.strides().map(|stride| stride as f32),
+            origin: load(&packet.origin),
+            direction,
+            inverse: load(&packet.inverse),
+            forward: is_forward.map(|forward| forward.select(one, zero)),
+            sign: is_forward.map(|forward| forward.select(one, -one)),
+            ends: f32x16::simd_from(simd, packet.ends),
+        }
+    }
+
+    #[inline(always)]
+    fn splat(&self, value: f32) -> f32x16<S> {
+        f32x16::splat(self.simd, value)
+    }
+
+    /// Positions along each axis.
+    #[inline(always)]
+    fn at(&self, t: f32x16<S>) -> [f32x16<S>; 3] {
+        let along = |axis: usize| t * self.direction[axis] + self.origin[axis];
+        [along(0), along(1), along(2)]
+    }
+
+    /// The cells of the map for bricks, those of rays that are not `active` being empty.
+    #[inline(always)]
+    fn cells(&self, bricks: [f32x16<S>; 3], active: mask32x16<S>) -> i32x16<S> {
+        let at = bricks[0] * self.strides[0] + bricks[1] * self.strides[1] + bricks[2];
+        let at = active.select(at.to_int::<i32x16<S>>(), i32x16::splat(self.simd, 0));
+        gather_i32(self.simd, self.map.cells(), at)
+    }
+
+    /// How a ray leaves a box that ends at these faces.
+    #[inline(always)]
+    fn leave(&self, faces: [f32x16<S>; 3], t: f32x16<S>) -> Leaving<S> {
+        let along = |axis: usize| (faces[axis] - self.origin[axis]) * self.inverse[axis];
+        let t_faces = [along(0), along(1), along(2)];
+        let t = t_faces[0].min(t_faces[1]).min(t_faces[2]).max(t);
+        Leaving { faces, t_faces, t }
+    }
+
+    /// How rays leave the voxels they are in, or the bricks that hold one value or none, and the voxels behind.
+    #[inline(always)]
+    fn step(&self, voxels: [f32x16<S>; 3], cells: i32x16<S>, active: mask32x16<S>, t: f32x16<S>) -> Step<S> {
+        let faces = self.faces(voxels, self.splat(0.0));
+        let is_whole = cells.simd_lt(0) | cells.simd_ge(SPECIAL);
+        if !(is_whole & active).any_true() {
+            let leaving = self.leave(faces, t);
+            return Step { t: leaving.t, behind: self.next(&leaving, voxels) };
+        }
+        let brick_faces = self.faces(bricks_of(voxels), self.beyond(cells));
+        let along = |axis: usize| is_whole.select(brick_faces[axis] * 8.0, faces[axis]);
+        let leaving = self.leave([along(0), along(1), along(2)], t);
+        Step { t: leaving.t, behind: self.behind(&leaving, voxels) }
+    }
+
+    /// Where rays leave the bricks they are in, or as many empty ones as there are.
+    #[inline(always)]
+    fn leave_bricks(&self, bricks: [f32x16<S>; 3], beyond: f32x16<S>, t: f32x16<S>) -> f32x16<S> {
+        let faces = self.faces(bricks, beyond);
+        self.leave([faces[0] * 8.0, faces[1] * 8.0, faces[2] * 8.0], t).t
+    }
+
+    /// How rays leave the bricks they are in, or as many empty ones as there are, and the bricks behind.
+    #[inline(always)]
+    fn step_bricks(&self, bricks: [f32x16<S>; 3], beyond: f32x16<S>, t: f32x16<S>) -> Step<S> {
+        let faces = self.faces(bricks, beyond);
+        let along = |axis: usize| faces[axis] * 8.0;
+        let leaving = self.leave([along(0), along(1), along(2)], t);
+        let position = self.at(leaving.t);
+        let along = |axis: usize| self.inside(&leaving, axis, position[axis] * 0.125, bricks[axis], faces[axis]);
+        Step { t: leaving.t, behind: [along(0), along(1), along(2)] }
+    }
+
+    /// The places behind the faces by which rays leave boxes, in units of the lattice; along other axes they stay in the box.
+    #[inline(always)]
+    fn inside(
+        &self,
+        leaving: &Leaving<S>,
+        axis: usize,
+        position: f32x16<S>,
+        place: f32x16<S>,
+        face: f32x16<S>,
+    ) -> f32x16<S> {
+        let last = face - self.forward[axis];
+        let inside = position.trunc().max(place.min(last)).min(place.max(last));
+        leaving.t_faces[axis].simd_le(leaving.t).select(last + self.sign[axis], inside)
+    }
+
+    #[inline(always)]
+    fn behind(&self, leaving: &Leaving<S>, voxels: [f32x16<S>; 3]) -> [f32x16<S>; 3] {
+        let position = self.at(leaving.t);
+        let along =
+            |axis: usize| self.inside(leaving, axis, position[axis], voxels[axis], leaving.faces[axis]);
+        [along(0), along(1), along(2)]
+    }
+
+    /// The same where each box is one voxel.
+    #[inline(always)]
+    fn next(&self, leaving: &Leaving<S>, voxels: [f32x16<S>; 3]) -> [f32x16<S>; 3] {
+        let along = |axis: usize| {
+            let next = voxels[axis] + self.sign[axis];
+            leaving.t_faces[axis].simd_le(leaving.t).select(next, voxels[axis])
+        };
+        [along(0), along(1), along(2)]
+    }
+
+    /// The faces towards which rays go, of the boxes of a lattice or of as many more as are `beyond` in all directions.
+    #[inline(always)]
+    fn faces(&self, places: [f32x16<S>; 3], beyond: f32x16<S>) -> [f32x16<S>; 3] {
+        let along = |axis: usize| places[axis] + self.forward[axis] + self.sign[axis] * beyond;
+        [along(0), along(1), along(2)]
+    }
+
+    /// How many bricks around are empty as well; 0 where a cell holds something.
+    #[inline(always)]
+    fn beyond(&self, cells: i32x16<S>) -> f32x16<S> {
+        let minus_one = i32x16::splat(self.simd, -1);
+        (minus_one - cells.min(minus_one)).to_float::<f32x16<S>>()
+    }
+
+    /// The eight corners of the cells that begin at voxels, in those lanes whose bricks have entries: corner `i` at
+    /// `dx << 2 | dy << 1 | dz`. Other lanes get zeros.
+    #[inline(always)]
+    fn corners<'a>(
+        &self,
+        field: &Field<'a>,
+        blocks: &mut Blocks<'a>,
+        cells: i32x16<S>,
+        voxels: [i32x16<S>; 3],
+    ) -> [f32x16<S>; 8] {
+        let local = [voxels[0] & 7, voxels[1] & 7, voxels[2] & 7];
+        let row = (local[0] << 3) + local[0] + local[1];
+        let offsets = ((row << 3) + row + local[2]).to_array();
+        let entries = cells.to_array();
+        let found = loop {
+            let mut missing = 0_u32;
+            let found = each_ray!(|lane| {
+                let entry = entries[lane];
+                match (0..SPECIAL).contains(&entry).then(|| blocks.known(entry as usize)) {
+                    Some(Some(block)) => corners_from(block, offsets[lane] as usize),
+                    None => &NOWHERE,
+                    Some(None) => {
+                        missing |= 1 << lane;
+                        &NOWHERE
+                    }
+                }
+            });
+            if missing == 0 {
+                break found;
+            }
+            let voxels = voxels.map(|along| along.to_array());
+            each_bit(missing, |lane| {
+                let voxel = IVec3::new(voxels[0][lane], voxels[1][lane], voxels[2][lane]);
+                blocks.of_entry(entries[lane] as usize, || field.brick_at(voxel.as_vec3()));
+            });
+        };
+        let corner = |at: usize| f32x16::simd_from(self.simd, each_ray!(|lane| found[lane][at]));
+        [corner(0), corner(1), corner(9), corner(10), corner(81), corner(82), corner(90), corner(91)]
+    }
+}
+
+/// Calls with the number of each bit that is set.
+#[inline(always)]
+fn each_bit(mut bits: u32, mut call: impl FnMut(usize)) {
+    while bits != 0 {
+        call(bits.trailing_zeros() as usize);
+        bits &= bits - 1;
+    }
+}
+
+/// The bricks of voxels.
+#[inline(always)]
+fn bricks_of<S: Simd>(voxels: [f32x16<S>; 3]) -> [f32x16<S>; 3] {
+    [(voxels[0] * 0.125).trunc(), (voxels[1] * 0.125).trunc(), (voxels[2] * 0.125).trunc()]
+}
+
+#[inline(always)]
+fn trunc<S: Simd>(positions: [f32x16<S>; 3]) -> [f32x16<S>; 3] {
+    [positions[0].trunc(), positions[1].trunc(), positions[2].trunc()]
+}
+
+#[inline(always)]
+fn to_int<S: Simd>(positions: [f32x16<S>; 3]) -> [i32x16<S>; 3] {
+    [positions[0].to_int(), positions[1].to_int(), positions[2].to_int()]
+}
+
+/// Between the eight corners of cells, at fractions along each axis.
+#[inline(always)]
+fn interpolate<S: Simd>(c: [f32x16<S>; 8], [x, y, z]: [f32x16<S>; 3]) -> f32x16<S> {
+    let mix = |a: f32x16<S>, b: f32x16<S>, t: f32x16<S>| a + (b - a) * t;
+    let low = mix(mix(c[0], c[1], z), mix(c[2], c[3], z), y);
+    let high = mix(mix(c[4], c[5], z), mix(c[6], c[7], z), y);
+    mix(low, high, x)
+}
