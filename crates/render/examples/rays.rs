@@ -14,9 +14,7 @@ use nuage_pipeline::import::{import, import_surface};
 use nuage_render::camera::{Camera, Ray};
 use nuage_render::filter::Filter;
 use nuage_render::hash::{hash_pixel, hash_u32, unit_f32};
-use nuage_render::packet::{RAYS, optical_depths, stepped_transmittances};
-use nuage_render::surface::first_hit;
-use nuage_render::track::first_collision;
+use nuage_render::packet::{RAYS, Surface, first_collisions, optical_depths, stepped_transmittances};
 use nuage_render::traverse::{Field, Reader};
 use nuage_volume::channel::Channel;
 use rayon::prelude::*;
@@ -106,22 +104,29 @@ fn kernel_of<'r, 'a: 'r>(
             let depths = optical_depths(field, reader, &rays(&pixels), filter);
             depths.map(|depth| 1.0 - (-extinction * depth).exp())
         }),
-        "track" => Box::new(move |reader, pixels| std::array::from_fn(|i| { let [x, y] = pixels[i]; let ray = rays(&pixels)[i];
-            let (path, mut count) = (hash_pixel(x, y, 0, hash_u32(seed)), 0_u32);
-            let random = || {
-                count += 1;
-                unit_f32(hash_u32(path.wrapping_add(count)))
+        "track" => Box::new(move |reader, pixels| {
+            let paths = pixels.map(|[x, y]| hash_pixel(x, y, 0, hash_u32(seed)));
+            let mut counts = [0_u32; RAYS];
+            let random = |ray: usize| {
+                counts[ray] += 1;
+                unit_f32(hash_u32(paths[ray].wrapping_add(counts[ray])))
             };
-            f32::from(first_collision(field, reader, &ray, extinction, random).is_some())
-        })),
+            let hits = first_collisions(field, reader, &rays(&pixels), extinction, random);
+            hits.map(|hit| f32::from(hit.is_some()))
+        }),
         "surface" | "surface-shaded" => {
             let is_shaded = kernel == "surface-shaded";
-            Box::new(move |reader, pixels| rays(&pixels).map(|ray| {
-                first_hit(field, reader, &ray, level).map_or(0.0, |hit| match is_shaded {
-                    true => hit.normal.dot(ray.direction.as_vec3()).abs(),
-                    false => (hit.distance / voxel_size) as f32,
+            let surface = Surface::new(field, level);
+            Box::new(move |reader, pixels| {
+                let rays = rays(&pixels);
+                let hits = surface.first_hits(reader, &rays);
+                std::array::from_fn(|i| {
+                    hits[i].map_or(0.0, |hit| match is_shaded {
+                        true => hit.normal.dot(rays[i].direction.as_vec3()).abs(),
+                        false => (hit.distance / voxel_size) as f32,
+                    })
                 })
-            }))
+            })
         }
         _ => return Err(format!("no kernel '{kernel}'").into()),
     })

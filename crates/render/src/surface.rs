@@ -60,11 +60,21 @@ pub fn first_hit<'a>(
             Some((start, t, sorted.local.at(t)))
         }
     ))?;
+    Some(hit(field, blocks, ray, start + f64::from(t), position))
+}
+
+/// What a ray meets at a distance, which is a position of the walk.
+pub(crate) fn hit<'a>(
+    field: &Field<'a>,
+    blocks: &mut Blocks<'a>,
+    ray: &Ray,
+    distance: f64,
+    position: Vec3,
+) -> SurfaceHit {
     let slope = slope(field, blocks, position);
     // A normal turns with the transposed inverse of what turns points.
     let normal = (field.directions().transpose() * -slope).try_normalize();
-    let normal = normal.unwrap_or(-ray.direction.as_vec3());
-    Some(SurfaceHit { distance: start + f64::from(t), normal })
+    SurfaceHit { distance, normal: normal.unwrap_or(-ray.direction.as_vec3()) }
 }
 
 /// The first voxel of a value above `above`, which is not negative; voxels are boxes around their places.
@@ -132,7 +142,7 @@ fn meet_surface<'a, S: Simd>(
 
 /// Where the interpolation in a cell reaches the surface, which it has done at the end.
 #[inline(always)]
-fn meet_in_cell(block: &Block, origin: Vec3, direction: Vec3, [t0, t1]: [f32; 2], surface: f32) -> f32 {
+pub(crate) fn meet_in_cell(block: &Block, origin: Vec3, direction: Vec3, [t0, t1]: [f32; 2], surface: f32) -> f32 {
     let cell = (origin + direction * (0.5 * (t0 + t1))).clamp(Vec3::ZERO, Vec3::splat(7.0)).floor();
     let c = corners_at(block, cell);
     let value = |t: f32| {

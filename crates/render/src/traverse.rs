@@ -136,6 +136,12 @@ impl<'a> Field<'a> {
         self.maps[sight as usize].get_or_init(make).as_ref()
     }
 
+    /// A flat map of the bricks in which interpolation reaches a level.
+    pub(crate) fn map_above(&self, accessor: &mut Accessor<'a>, level: f32) -> Option<BrickMap> {
+        let [first, last] = self.brick_box;
+        BrickMap::above(accessor, level, first, last)
+    }
+
     /// The same for kernels over packets of rays, which know of no bricks that blend with tiles.
     #[inline]
     pub(crate) fn packet_map(&self, sight: Sight) -> Option<&BrickMap> {

@@ -20,6 +20,9 @@ use crate::traverse::{LocalRay, Runs, floor};
 /// The most bricks of a map: 16 MiB.
 const MOST_CELLS: i64 = 1 << 22;
 
+/// The most bricks along an axis: four million voxels.
+const MOST_ALONG: i64 = 1 << 19;
+
 /// A ray leaps where it is this far from bricks that are not empty.
 const LEAST_LEAP: i32 = 4;
 
@@ -123,6 +126,8 @@ pub(crate) struct BrickMap {
     specials: Vec<SpanContent>,
     /// The values of special cells, if that is all that they are.
     constants: Option<Box<[f32]>>,
+    /// By cell, the largest value that interpolation finds there; below 0 what the cell is. Of cells between voxels alone.
+    tops: Box<[f32]>,
 }
 
 impl BrickMap {
@@ -133,9 +138,40 @@ impl BrickMap {
         first: IVec3,
         last: IVec3,
     ) -> Option<BrickMap> {
+        let mut map = match sight {
+            Sight::Cells => BrickMap::of(first, last, |brick| cells_of(accessor, brick)),
+            Sight::Voxels => return BrickMap::of(first, last, |brick| voxels_of(accessor, brick)),
+        }?;
+        let tops = map.cells.iter().map(|cell| match *cell {
+            distance @ ..0 => distance as f32,
+            special @ SPECIAL.. => map.constants().get((special - SPECIAL) as usize).copied().unwrap_or(0.0),
+            entry => accessor.tree().node4.footprints[entry as usize].max,
+        });
+        map.tops = tops.collect();
+        Some(map)
+    }
+
+    /// The map of the bricks in which interpolation reaches a level.
+    pub(crate) fn above(
+        accessor: &mut Accessor<'_>,
+        level: f32,
+        first: IVec3,
+        last: IVec3,
+    ) -> Option<BrickMap> {
+        BrickMap::of(first, last, |brick| match cells_of(accessor, brick) {
+            SpanContent::Constant(value) if value < level => SpanContent::Constant(0.0),
+            SpanContent::Brick(entry) if accessor.tree().node4.footprints[entry as usize].max < level => {
+                SpanContent::Constant(0.0)
+            }
+            content => content,
+        })
+    }
+
+    /// The map of what is in the bricks from `first` to `last`.
+    fn of(first: IVec3, last: IVec3, mut content_of: impl FnMut(IVec3) -> SpanContent) -> Option<BrickMap> {
         let size = last.as_i64vec3() - first.as_i64vec3() + 3;
-        // Each axis by itself first, so that the product does not overflow.
-        if size.max_element() > MOST_CELLS || size.element_product() > MOST_CELLS {
+        // Each axis by itself first, so that the product does not overflow and voxels can be told apart in single precision.
+        if size.max_element() > MOST_ALONG || size.element_product() > MOST_CELLS {
             return None;
         }
         let size = size.as_ivec3();
@@ -145,7 +181,7 @@ impl BrickMap {
         for x in 1..size.x - 1 {
             for y in 1..size.y - 1 {
                 for z in 1..size.z - 1 {
-                    let content = content_of(accessor, sight, first + IVec3::new(x, y, z) - 1);
+                    let content = content_of(first + IVec3::new(x, y, z) - 1);
                     if content == SpanContent::Constant(0.0) {
                         continue;
                     }
@@ -175,7 +211,7 @@ impl BrickMap {
             _ => None,
         });
         let constants = constants.collect();
-        Some(BrickMap { cells: cells.into(), size, specials, constants })
+        Some(BrickMap { cells: cells.into(), size, specials, constants, tops: Box::default() })
     }
 
     /// How far apart neighbours along each axis are.
@@ -195,6 +231,12 @@ impl BrickMap {
         self.constants.as_deref().unwrap_or_default()
     }
 
+    /// The largest value of each cell; below 0 the cell itself, which is empty.
+    #[inline(always)]
+    pub(crate) fn tops(&self) -> &[f32] {
+        &self.tops
+    }
+
     /// All cells: below 0 as far away as the nearest brick that is not empty, from [`SPECIAL`] on special ones, else bricks.
     #[inline(always)]
     pub(crate) fn cells(&self) -> &[i32] {
@@ -204,14 +246,6 @@ impl BrickMap {
     #[inline(always)]
     fn cell(&self, at: i32) -> i32 {
         self.cells.get(at as usize).copied().unwrap_or(-1)
-    }
-}
-
-/// What a brick holds.
-fn content_of(accessor: &mut Accessor<'_>, sight: Sight, brick: IVec3) -> SpanContent {
-    match sight {
-        Sight::Cells => cells_of(accessor, brick),
-        Sight::Voxels => voxels_of(accessor, brick),
     }
 }
 

@@ -14,14 +14,18 @@ use glam::IVec3;
 
 use crate::blocks::Blocks;
 use crate::camera::Ray;
-use crate::gather::gather_i32;
+use crate::gather::{gather_f32, gather_i32};
 use crate::depth::{NOWHERE, corners_from};
 use crate::traverse::Field;
 use crate::walk::{BrickMap, SPECIAL};
 
 mod lines;
+mod surfaces;
+mod tracks;
 
 pub use lines::{optical_depths, stepped_transmittances};
+pub use surfaces::Surface;
+pub use tracks::first_collisions;
 
 /// Rays of a packet.
 pub const RAYS: usize = 16;
@@ -194,12 +198,23 @@ impl<'m, S: Simd> Lanes<'m, S> {
         [along(0), along(1), along(2)]
     }
 
+    /// Where bricks stand in the map; an empty one for rays that are not `active`.
+    #[inline(always)]
+    fn places(&self, bricks: [f32x16<S>; 3], active: mask32x16<S>) -> i32x16<S> {
+        let at = bricks[0] * self.strides[0] + bricks[1] * self.strides[1] + bricks[2];
+        active.select(at.to_int::<i32x16<S>>(), i32x16::splat(self.simd, 0))
+    }
+
     /// The cells of the map for bricks, those of rays that are not `active` being empty.
     #[inline(always)]
     fn cells(&self, bricks: [f32x16<S>; 3], active: mask32x16<S>) -> i32x16<S> {
-        let at = bricks[0] * self.strides[0] + bricks[1] * self.strides[1] + bricks[2];
-        let at = active.select(at.to_int::<i32x16<S>>(), i32x16::splat(self.simd, 0));
-        gather_i32(self.simd, self.map.cells(), at)
+        gather_i32(self.simd, self.map.cells(), self.places(bricks, active))
+    }
+
+    /// The largest value at places of the map; below 0 it says how far away others are, as cells do.
+    #[inline(always)]
+    fn tops(&self, places: i32x16<S>) -> f32x16<S> {
+        gather_f32(self.simd, self.map.tops(), places)
     }
 
     /// How a ray leaves a box that ends at these faces.
