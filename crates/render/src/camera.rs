@@ -65,14 +65,13 @@ impl Camera {
     #[inline(always)]
     fn rays_by_axis<const N: usize>(&self, pixels: &[DVec2; N], width: f64, height: f64) -> [Ray; N] {
         let (mut direction, mut length) = ([[0.0; N]; 3], [0.0; N]);
-        for axis in 0..3 {
+        for (axis, direction) in direction.iter_mut().enumerate() {
             let (forward, right, up) = (self.forward[axis], self.right[axis], self.up[axis]);
-            for i in 0..N {
-                let x = (2.0 * pixels[i].x / width - 1.0) * self.half_width_tangent;
-                let y = (height - 2.0 * pixels[i].y) / width * self.half_width_tangent;
-                let along = forward + x * right + y * up;
-                direction[axis][i] = along;
-                length[i] += along * along;
+            for ((along, length), pixel) in direction.iter_mut().zip(&mut length).zip(pixels) {
+                let x = (2.0 * pixel.x / width - 1.0) * self.half_width_tangent;
+                let y = (height - 2.0 * pixel.y) / width * self.half_width_tangent;
+                *along = forward + x * right + y * up;
+                *length += *along * *along;
             }
         }
         for length in &mut length {

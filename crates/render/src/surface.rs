@@ -60,18 +60,11 @@ pub fn first_hit<'a>(
             Some((start, t, sorted.local.at(t)))
         }
     ))?;
-    Some(hit(field, blocks, ray, start + f64::from(t), position))
+    Some(hit(field, ray, start + f64::from(t), slope(field, blocks, position)))
 }
 
-/// What a ray meets at a distance, which is a position of the walk.
-pub(crate) fn hit<'a>(
-    field: &Field<'a>,
-    blocks: &mut Blocks<'a>,
-    ray: &Ray,
-    distance: f64,
-    position: Vec3,
-) -> SurfaceHit {
-    let slope = slope(field, blocks, position);
+/// What a ray meets at a distance, the field having a slope there along each axis of the walk.
+pub(crate) fn hit(field: &Field<'_>, ray: &Ray, distance: f64, slope: Vec3) -> SurfaceHit {
     // A normal turns with the transposed inverse of what turns points.
     let normal = (field.directions().transpose() * -slope).try_normalize();
     SurfaceHit { distance, normal: normal.unwrap_or(-ray.direction.as_vec3()) }

@@ -142,12 +142,6 @@ impl<'a> Field<'a> {
         BrickMap::above(accessor, level, first, last)
     }
 
-    /// The same for kernels over packets of rays, which know of no bricks that blend with tiles.
-    #[inline]
-    pub(crate) fn packet_map(&self, sight: Sight) -> Option<&BrickMap> {
-        self.map(sight).filter(|map| map.is_plain())
-    }
-
     /// The brick whose first voxel is at a position of the walk.
     pub(crate) fn brick_at(&self, corner: Vec3) -> IVec3 {
         (corner * 0.125).as_ivec3().wrapping_add(self.base_brick)

@@ -26,8 +26,12 @@ const MOST_ALONG: i64 = 1 << 19;
 /// A ray leaps where it is this far from bricks that are not empty.
 const LEAST_LEAP: i32 = 4;
 
-/// Cells of a map from here on are indices of contents of other kinds than a brick's.
+/// The cell of a map whose brick is part of a tile and blends with the tile's neighbours.
+pub(crate) const BORDER: i32 = SPECIAL - 1;
+
+/// Cells of a map from here on have one value each.
 pub(crate) const SPECIAL: i32 = 1 << 30;
+
 /// The furthest that is told of an empty brick.
 const FURTHEST: u8 = 255;
 
@@ -120,12 +124,11 @@ impl Spans for TreeWalk<'_, '_> {
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct BrickMap {
     /// By `(x * size.y + y) * size.z + z`, with a layer of empty bricks all around. Below 0 the brick is empty, as are all those
-    /// less than `-cell` away along each axis. From [`SPECIAL`] on it is the index of a content; else that of a brick.
+    /// less than `-cell` away along each axis. From [`SPECIAL`] on it is the index of a constant; else that of a brick, or
+    /// [`BORDER`].
     cells: Box<[i32]>,
     size: IVec3,
-    specials: Vec<SpanContent>,
-    /// The values of special cells, if that is all that they are.
-    constants: Option<Box<[f32]>>,
+    constants: Vec<f32>,
     /// By cell, the largest value that interpolation finds there; below 0 what the cell is. Of cells between voxels alone.
     tops: Box<[f32]>,
 }
@@ -142,9 +145,10 @@ impl BrickMap {
             Sight::Cells => BrickMap::of(first, last, |brick| cells_of(accessor, brick)),
             Sight::Voxels => return BrickMap::of(first, last, |brick| voxels_of(accessor, brick)),
         }?;
-        let tops = map.cells.iter().map(|cell| match *cell {
+        let tops = (0..).zip(&map.cells).map(|(at, cell)| match *cell {
             distance @ ..0 => distance as f32,
-            special @ SPECIAL.. => map.constants().get((special - SPECIAL) as usize).copied().unwrap_or(0.0),
+            special @ SPECIAL.. => map.constant(special),
+            BORDER => accessor.region(first + map.brick(at)).footprint.max,
             entry => accessor.tree().node4.footprints[entry as usize].max,
         });
         map.tops = tops.collect();
@@ -177,7 +181,7 @@ impl BrickMap {
         let size = size.as_ivec3();
         let mut distances = vec![FURTHEST; size.element_product() as usize];
         let mut cells = vec![0; distances.len()];
-        let mut specials = Vec::new();
+        let mut constants = Vec::new();
         for x in 1..size.x - 1 {
             for y in 1..size.y - 1 {
                 for z in 1..size.z - 1 {
@@ -188,14 +192,16 @@ impl BrickMap {
                     let at = ((x * size.y + y) * size.z + z) as usize;
                     distances[at] = 0;
                     cells[at] = match content {
-                        SpanContent::Brick(index) if index < SPECIAL as u32 => index as i32,
-                        // Neighbours often hold the same. There are fewer contents than cells.
-                        _ => {
-                            if specials.last() != Some(&content) {
-                                specials.push(content);
+                        SpanContent::Brick(index) if index < BORDER as u32 => index as i32,
+                        SpanContent::Constant(value) => {
+                            // Neighbours often hold the same. There are fewer constants than cells.
+                            if constants.last() != Some(&value) {
+                                constants.push(value);
                             }
-                            SPECIAL + specials.len() as i32 - 1
+                            SPECIAL + constants.len() as i32 - 1
                         }
+                        // More bricks than a map has cells do not occur.
+                        SpanContent::Brick(_) | SpanContent::TileBorder => BORDER,
                     };
                 }
             }
@@ -206,12 +212,18 @@ impl BrickMap {
                 *cell = -i32::from(distance);
             }
         }
-        let constants = specials.iter().map(|content| match content {
-            SpanContent::Constant(value) => Some(*value),
-            _ => None,
-        });
-        let constants = constants.collect();
-        Some(BrickMap { cells: cells.into(), size, specials, constants, tops: Box::default() })
+        Some(BrickMap { cells: cells.into(), size, constants, tops: Box::default() })
+    }
+
+    /// The brick of a cell, counted from the map's first.
+    fn brick(&self, at: i32) -> IVec3 {
+        let [x, y, _] = self.strides();
+        IVec3::new(at / x, at % x / y, at % y) - 1
+    }
+
+    /// The value of a cell from [`SPECIAL`] on.
+    fn constant(&self, cell: i32) -> f32 {
+        self.constants.get((cell - SPECIAL) as usize).copied().unwrap_or(0.0)
     }
 
     /// How far apart neighbours along each axis are.
@@ -219,16 +231,10 @@ impl BrickMap {
         [self.size.y * self.size.z, self.size.z, 1]
     }
 
-    /// Whether each cell is empty, a brick or of one value.
-    #[inline(always)]
-    pub(crate) fn is_plain(&self) -> bool {
-        self.constants.is_some()
-    }
-
-    /// The values of the cells from [`SPECIAL`] on, if all of these have one.
+    /// The values of the cells from [`SPECIAL`] on.
     #[inline(always)]
     pub(crate) fn constants(&self) -> &[f32] {
-        self.constants.as_deref().unwrap_or_default()
+        &self.constants
     }
 
     /// The largest value of each cell; below 0 the cell itself, which is empty.
@@ -237,7 +243,7 @@ impl BrickMap {
         &self.tops
     }
 
-    /// All cells: below 0 as far away as the nearest brick that is not empty, from [`SPECIAL`] on special ones, else bricks.
+    /// All cells.
     #[inline(always)]
     pub(crate) fn cells(&self) -> &[i32] {
         &self.cells
@@ -602,9 +608,10 @@ impl<S: Simd> Spans for MapWalk<'_, S> {
         // Stretches are 0 to 2, so the highest index is 23.
         let at = ((number & 3) * 8 + (number >> 2)) as usize % 24;
         let cell = self.cells[at];
-        let content = match cell < SPECIAL {
-            true => SpanContent::Brick(cell as u32),
-            false => self.map.specials[(cell - SPECIAL) as usize],
+        let content = match cell {
+            ..BORDER => SpanContent::Brick(cell as u32),
+            BORDER => SpanContent::TileBorder,
+            _ => SpanContent::Constant(self.map.constant(cell)),
         };
         let brick = [self.bricks[0][at], self.bricks[1][at], self.bricks[2][at]];
         let corner = IVec3::from_array(self.ray.order.restored(brick)).as_vec3() * 8.0;

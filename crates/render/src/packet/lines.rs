@@ -4,10 +4,11 @@ use fearless_simd::{Level, Simd, dispatch, f32x16, i32x16, prelude::*};
 use nuage_volume::brick::Bricks;
 
 use super::{Lanes, Packet, RAYS, bricks_of, each_ray, interpolate, to_int, trunc};
+use crate::blocks::Blocks;
 use crate::camera::Ray;
 use crate::depth::{self, NEAREST_SHIFT, Stored};
 use crate::filter::Filter;
-use crate::gather::{gather_f32, prefetch};
+use crate::gather::prefetch;
 use crate::simd::level;
 use crate::traverse::{Field, Reader};
 use crate::walk::{SPECIAL, Sight};
@@ -42,7 +43,7 @@ fn optical_depths_at<'a>(
     filter: Filter,
 ) -> [f32; RAYS] {
     let (sight, shift) = sight_of(filter);
-    let Some(map) = field.packet_map(sight) else {
+    let Some(map) = field.map(sight) else {
         return each_ray!(|lane| depth::optical_depth_at(level, field, reader, &rays[lane], filter));
     };
     dispatch!(level, simd => simd.vectorize(
@@ -53,7 +54,7 @@ fn optical_depths_at<'a>(
             match (filter, &field.tree().bricks) {
                 (Filter::Nearest, Bricks::F32(values)) => integrate_voxels(&lanes, values),
                 (Filter::Nearest, Bricks::F16(values)) => integrate_voxels(&lanes, values),
-                (Filter::Trilinear, _) => integrate_cells(&lanes, field, reader),
+                (Filter::Trilinear, _) => integrate_cells(&lanes, field, &mut reader.blocks),
             }
         }
     ))
@@ -69,7 +70,7 @@ fn stepped_transmittances_at<'a>(
     extinction: f32,
 ) -> [f32; RAYS] {
     let (sight, shift) = sight_of(filter);
-    let Some(map) = field.packet_map(sight) else {
+    let Some(map) = field.map(sight) else {
         return each_ray!(|lane| {
             depth::stepped_transmittance_at(level, field, reader, &rays[lane], filter, step_voxels, extinction)
         });
@@ -81,9 +82,9 @@ fn stepped_transmittances_at<'a>(
             let lanes = Lanes::new(simd, map, &packet);
             let steps = f32x16::simd_from(simd, each_ray!(|lane| packet.steps[lane] as f32));
             match (filter, &field.tree().bricks) {
-                (Filter::Nearest, Bricks::F32(values)) => step_voxels_of(&lanes, values, steps, extinction),
-                (Filter::Nearest, Bricks::F16(values)) => step_voxels_of(&lanes, values, steps, extinction),
-                (Filter::Trilinear, _) => step_cells(&lanes, field, reader, steps, extinction),
+                (Filter::Nearest, Bricks::F32(values)) => sample_voxels(&lanes, values, steps, extinction),
+                (Filter::Nearest, Bricks::F16(values)) => sample_voxels(&lanes, values, steps, extinction),
+                (Filter::Trilinear, _) => sample_cells(&lanes, field, &mut reader.blocks, steps, extinction),
             }
         }
     ))
@@ -106,7 +107,7 @@ fn values_of<S: Simd, V: Stored>(
 ) -> f32x16<S> {
     let simd = lanes.simd;
     let found = V::gather(simd, values, places_of(simd, cells, voxels));
-    with_specials(lanes, cells, found)
+    lanes.with_specials(cells, found)
 }
 
 /// The places of voxels in the values of all bricks; beyond all where cells hold no brick.
@@ -115,23 +116,6 @@ fn places_of<S: Simd>(simd: S, cells: i32x16<S>, voxels: [i32x16<S>; 3]) -> i32x
     let offsets = ((voxels[0] & 7) << 6) | ((voxels[1] & 7) << 3) | (voxels[2] & 7);
     let holds_brick = cells.simd_ge(0) & cells.simd_lt(SPECIAL);
     holds_brick.select((cells << 9) | offsets, i32x16::splat(simd, -1))
-}
-
-#[inline(always)]
-fn look_ahead<S: Simd, V>(lanes: &Lanes<'_, S>, values: &[V], t: f32x16<S>) {
-    let positions = lanes.at(t);
-    let cells = lanes.cells(bricks_of(positions), t.simd_lt(lanes.ends));
-    prefetch(values, places_of(lanes.simd, cells, to_int(positions)));
-}
-
-/// The values of special cells in their lanes.
-#[inline(always)]
-fn with_specials<S: Simd>(lanes: &Lanes<'_, S>, cells: i32x16<S>, others: f32x16<S>) -> f32x16<S> {
-    let is_special = cells.simd_ge(SPECIAL);
-    match is_special.any_true() {
-        true => is_special.select(gather_f32(lanes.simd, lanes.map.constants(), cells - SPECIAL), others),
-        false => others,
-    }
 }
 
 #[inline(always)]
@@ -153,7 +137,7 @@ fn integrate_voxels<S: Simd, V: Stored>(lanes: &Lanes<'_, S>, values: &[V]) -> [
 }
 
 #[inline(always)]
-fn integrate_cells<'a, S: Simd>(lanes: &Lanes<'_, S>, field: &Field<'a>, reader: &mut Reader<'a>) -> [f32; RAYS] {
+fn integrate_cells<'a, S: Simd>(lanes: &Lanes<'_, S>, field: &Field<'a>, blocks: &mut Blocks<'a>) -> [f32; RAYS] {
     let (mut t, mut depth) = (lanes.splat(0.0), lanes.splat(0.0));
     let mut voxels = trunc(lanes.at(t));
     loop {
@@ -163,76 +147,90 @@ fn integrate_cells<'a, S: Simd>(lanes: &Lanes<'_, S>, field: &Field<'a>, reader:
         }
         let cells = lanes.cells(bricks_of(voxels), active);
         let step = lanes.step(voxels, cells, active, t);
-        let end = step.t.min(lanes.ends);
-        let length = end - t;
         if (cells.simd_ge(0) & active).any_true() {
-            let corners = lanes.corners(field, &mut reader.blocks, cells, to_int(voxels));
+            let end = step.t.min(lanes.ends);
+            let length = end - t;
+            let corners = lanes.corners(field, blocks, cells, to_int(voxels));
             let middle = lanes.at((t + end) * 0.5);
             let along = |axis: usize| (middle[axis] - voxels[axis], lanes.direction[axis] * length);
             let ((x, dx), (y, dy), (z, dz)) = (along(0), along(1), along(2));
             let mean = depth::mean_in_cell!(corners, [x, y, z], [dx, dy, dz]);
-            depth += with_specials(lanes, cells, mean) * length;
+            depth += lanes.with_specials(cells, mean) * length;
         }
         (t, voxels) = (step.t, step.behind);
     }
 }
 
+/// Goes from cell to cell: two samples or so lie in each, and its corners are looked up once.
 #[inline(always)]
-fn step_voxels_of<S: Simd, V: Stored>(
+fn sample_cells<'a, S: Simd>(
+    lanes: &Lanes<'_, S>,
+    field: &Field<'a>,
+    blocks: &mut Blocks<'a>,
+    steps: f32x16<S>,
+    extinction: f32,
+) -> [f32; RAYS] {
+    let (zero, one) = (lanes.splat(0.0), lanes.splat(1.0));
+    let (per_step, loss) = (one / steps, steps * extinction);
+    let (mut number, mut t, mut passes) = (zero, zero, one);
+    let mut voxels = trunc(lanes.at(t));
+    loop {
+        let active = t.simd_lt(lanes.ends);
+        if !active.any_true() {
+            return passes.to_array();
+        }
+        let cells = lanes.cells(bricks_of(voxels), active);
+        let step = lanes.step(voxels, cells, active, t);
+        let end = step.t.min(lanes.ends);
+        let is_empty = cells.simd_lt(0);
+        let mut t_sample = number * steps;
+        let mut inside = active & !is_empty & t_sample.simd_lt(end);
+        if inside.any_true() {
+            let corners = lanes.corners(field, blocks, cells, to_int(voxels));
+            while inside.any_true() {
+                let position = lanes.at(t_sample);
+                let along = |axis: usize| position[axis] - voxels[axis];
+                let value = interpolate(&corners, [along(0), along(1), along(2)]);
+                let lost = lanes.with_specials(cells, value) * loss;
+                passes *= one - inside.select(lost, zero);
+                number += inside.select(one, zero);
+                t_sample = number * steps;
+                inside = inside & t_sample.simd_lt(end);
+            }
+        }
+        if is_empty.any_true() {
+            number = is_empty.select((end * per_step).ceil().max(number), number);
+        }
+        (t, voxels) = (step.t, step.behind);
+    }
+}
+
+/// Goes from sample to sample.
+#[inline(always)]
+fn sample_voxels<S: Simd, V: Stored>(
     lanes: &Lanes<'_, S>,
     values: &[V],
     steps: f32x16<S>,
     extinction: f32,
 ) -> [f32; RAYS] {
-    each_step(lanes, steps, extinction, |cells, positions, t, i| {
-        if i & 7 == 0 {
-            look_ahead(lanes, values, t + steps * 16.0);
-        }
-        values_of(lanes, values, cells, to_int(positions))
-    })
-}
-
-#[inline(always)]
-fn step_cells<'a, S: Simd>(
-    lanes: &Lanes<'_, S>,
-    field: &Field<'a>,
-    reader: &mut Reader<'a>,
-    steps: f32x16<S>,
-    extinction: f32,
-) -> [f32; RAYS] {
-    each_step(lanes, steps, extinction, |cells, positions, _, _| {
-        let voxels = trunc(positions);
-        let corners = lanes.corners(field, &mut reader.blocks, cells, to_int(voxels));
-        let along = |axis: usize| positions[axis] - voxels[axis];
-        with_specials(lanes, cells, interpolate(corners, [along(0), along(1), along(2)]))
-    })
-}
-
-/// Multiplies what passes each step, `value` giving the values of cells of the map at positions.
-#[inline(always)]
-fn each_step<S: Simd>(
-    lanes: &Lanes<'_, S>,
-    steps: f32x16<S>,
-    extinction: f32,
-    mut value: impl FnMut(i32x16<S>, [f32x16<S>; 3], f32x16<S>, u32) -> f32x16<S>,
-) -> [f32; RAYS] {
     let (one, per_step, loss) = (lanes.splat(1.0), lanes.splat(1.0) / steps, steps * extinction);
-    let mut i = 0;
     let (mut number, mut passes) = (lanes.splat(0.0), one);
-    loop {
+    for turn in 0_u32.. {
         let t = number * steps;
         let active = t.simd_lt(lanes.ends);
         if !active.any_true() {
-            return passes.to_array();
+            break;
         }
-        let positions = lanes.at(t);
-        let bricks = bricks_of(positions);
+        let position = lanes.at(t);
+        let bricks = bricks_of(position);
         let cells = lanes.cells(bricks, active);
         let is_empty = cells.simd_lt(0);
         number += one;
-        i += 1;
-        if !(is_empty & active).all_true() {
-            passes *= one - value(cells, positions, t, i) * loss;
+        if !is_empty.all_true() {
+            if turn % LOOK_AHEAD_EACH == 0 {
+                look_ahead(lanes, values, t + steps * (2 * LOOK_AHEAD_EACH) as f32);
+            }
+            passes *= one - values_of(lanes, values, cells, to_int(position)) * loss;
         }
         if (is_empty & active).any_true() {
             let leaving = lanes.leave_bricks(bricks, lanes.beyond(cells), t);
@@ -240,4 +238,17 @@ fn each_step<S: Simd>(
             number = is_empty.select(next, number);
         }
     }
+    passes.to_array()
+}
+
+/// Each so many samples, the lines of the cache are asked for in which those stand that come as many later. A brick comes
+/// into the caches while the one before it is worked on.
+const LOOK_AHEAD_EACH: u32 = 8;
+
+/// Asks for the values at `t`.
+#[inline(always)]
+fn look_ahead<S: Simd, V>(lanes: &Lanes<'_, S>, values: &[V], t: f32x16<S>) {
+    let position = lanes.at(t);
+    let cells = lanes.cells(bricks_of(position), t.simd_lt(lanes.ends));
+    prefetch(values, places_of(lanes.simd, cells, to_int(position)));
 }

@@ -12,12 +12,13 @@
 use fearless_simd::{Simd, f32x16, i32x16, mask32x16, prelude::*};
 use glam::IVec3;
 
-use crate::blocks::Blocks;
+use crate::blocks::{Blocks, SIDE};
 use crate::camera::Ray;
 use crate::gather::{gather_f32, gather_i32};
-use crate::depth::{NOWHERE, corners_from};
+use crate::simd::each_lane;
+use crate::depth::{NOWHERE, corners_at, corners_from};
 use crate::traverse::Field;
-use crate::walk::{BrickMap, SPECIAL};
+use crate::walk::{BORDER, BrickMap, SPECIAL};
 
 mod lines;
 mod surfaces;
@@ -217,6 +218,16 @@ impl<'m, S: Simd> Lanes<'m, S> {
         gather_f32(self.simd, self.map.tops(), places)
     }
 
+    /// The values of special cells in their lanes.
+    #[inline(always)]
+    fn with_specials(&self, cells: i32x16<S>, others: f32x16<S>) -> f32x16<S> {
+        let is_special = cells.simd_ge(SPECIAL);
+        match is_special.any_true() {
+            true => is_special.select(gather_f32(self.simd, self.map.constants(), cells - SPECIAL), others),
+            false => others,
+        }
+    }
+
     /// How a ray leaves a box that ends at these faces.
     #[inline(always)]
     fn leave(&self, faces: [f32x16<S>; 3], t: f32x16<S>) -> Leaving<S> {
@@ -306,7 +317,7 @@ impl<'m, S: Simd> Lanes<'m, S> {
         (minus_one - cells.min(minus_one)).to_float::<f32x16<S>>()
     }
 
-    /// The eight corners of the cells that begin at voxels, in those lanes whose bricks have entries: corner `i` at
+    /// The eight corners of the cells that begin at voxels, in those lanes whose cell of the map has a brick: corner `i` at
     /// `dx << 2 | dy << 1 | dz`. Other lanes get zeros.
     #[inline(always)]
     fn corners<'a>(
@@ -319,32 +330,57 @@ impl<'m, S: Simd> Lanes<'m, S> {
         let local = [voxels[0] & 7, voxels[1] & 7, voxels[2] & 7];
         let row = (local[0] << 3) + local[0] + local[1];
         let offsets = ((row << 3) + row + local[2]).to_array();
-        let entries = cells.to_array();
-        let found = loop {
-            let mut missing = 0_u32;
-            let found = each_ray!(|lane| {
-                let entry = entries[lane];
-                match (0..SPECIAL).contains(&entry).then(|| blocks.known(entry as usize)) {
-                    Some(Some(block)) => corners_from(block, offsets[lane] as usize),
-                    None => &NOWHERE,
-                    Some(None) => {
-                        missing |= 1 << lane;
-                        &NOWHERE
-                    }
+        let of_map = cells.to_array();
+        let mut missing = 0_u32;
+        let found = each_ray!(|lane| {
+            match (0..SPECIAL).contains(&of_map[lane]).then(|| blocks.known(of_map[lane] as usize)) {
+                Some(Some(block)) => corners_from(block, offsets[lane] as usize),
+                None => &NOWHERE,
+                Some(None) => {
+                    missing |= 1 << lane;
+                    &NOWHERE
                 }
-            });
-            if missing == 0 {
-                break found;
             }
-            let voxels = voxels.map(|along| along.to_array());
-            each_bit(missing, |lane| {
-                let voxel = IVec3::new(voxels[0][lane], voxels[1][lane], voxels[2][lane]);
-                blocks.of_entry(entries[lane] as usize, || field.brick_at(voxel.as_vec3()));
-            });
-        };
-        let corner = |at: usize| f32x16::simd_from(self.simd, each_ray!(|lane| found[lane][at]));
-        [corner(0), corner(1), corner(9), corner(10), corner(81), corner(82), corner(90), corner(91)]
+        });
+        // Not by a function that is called for each, which would not always be inlined.
+        let found = each_lane!(|i| f32x16::simd_from(self.simd, each_ray!(|lane| found[lane][CORNERS[i]])));
+        match missing {
+            0 => found,
+            _ => {
+                let voxels = [voxels[0].to_array(), voxels[1].to_array(), voxels[2].to_array()];
+                let mut corners = each_lane!(|i| found[i].to_array());
+                complete(field, blocks, missing, &of_map, &voxels, &mut corners);
+                each_lane!(|i| f32x16::simd_from(self.simd, corners[i]))
+            }
+        }
     }
+}
+
+/// Where the corners of a cell stand in a block, from its first corner on.
+const CORNERS: [usize; 8] = [0, 1, SIDE, SIDE + 1, SIDE * SIDE, SIDE * SIDE + 1, SIDE * SIDE + SIDE, SIDE * SIDE + SIDE + 1];
+
+/// The corners of cells whose brick is met for the first time, or is part of a tile.
+#[cold]
+#[inline(never)]
+fn complete<'a>(
+    field: &Field<'a>,
+    blocks: &mut Blocks<'a>,
+    missing: u32,
+    cells: &[i32; RAYS],
+    voxels: &[[i32; RAYS]; 3],
+    corners: &mut [[f32; RAYS]; 8],
+) {
+    each_bit(missing, |lane| {
+        let voxel = IVec3::new(voxels[0][lane], voxels[1][lane], voxels[2][lane]);
+        let brick = || field.brick_at(voxel.as_vec3());
+        let block = match cells[lane] {
+            BORDER => blocks.of_tile(brick()),
+            entry => blocks.of_entry(entry as usize, brick),
+        };
+        for (corners, value) in corners.iter_mut().zip(corners_at(block, (voxel & 7).as_vec3())) {
+            corners[lane] = value;
+        }
+    });
 }
 
 /// Calls with the number of each bit that is set.
@@ -374,7 +410,7 @@ fn to_int<S: Simd>(positions: [f32x16<S>; 3]) -> [i32x16<S>; 3] {
 
 /// Between the eight corners of cells, at fractions along each axis.
 #[inline(always)]
-fn interpolate<S: Simd>(c: [f32x16<S>; 8], [x, y, z]: [f32x16<S>; 3]) -> f32x16<S> {
+fn interpolate<S: Simd>(c: &[f32x16<S>; 8], [x, y, z]: [f32x16<S>; 3]) -> f32x16<S> {
     let mix = |a: f32x16<S>, b: f32x16<S>, t: f32x16<S>| a + (b - a) * t;
     let low = mix(mix(c[0], c[1], z), mix(c[2], c[3], z), y);
     let high = mix(mix(c[4], c[5], z), mix(c[6], c[7], z), y);

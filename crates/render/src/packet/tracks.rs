@@ -11,7 +11,7 @@ use crate::math::ln;
 use crate::simd::level;
 use crate::track;
 use crate::traverse::{Field, Reader};
-use crate::walk::{SPECIAL, Sight};
+use crate::walk::{BORDER, SPECIAL, Sight};
 
 /// The distance at which each ray collides with a medium of `extinction` at value 1, per world length:
 /// [`first_collision`](track::first_collision) of it.
@@ -35,13 +35,13 @@ fn first_collisions_at<'a>(
     extinction: f32,
     mut random: impl FnMut(usize) -> f32,
 ) -> [Option<f64>; RAYS] {
-    if field.packet_map(Sight::Cells).is_none() {
+    if field.map(Sight::Cells).is_none() {
         return each_ray!(|lane| track::first_collision(field, reader, &rays[lane], extinction, || random(lane)));
     }
     dispatch!(level, simd => simd.vectorize(
         #[inline(always)]
         || {
-            let map = field.packet_map(Sight::Cells)?;
+            let map = field.map(Sight::Cells)?;
             let packet = Packet::enter(field, rays, 0.0, None)?;
             let lanes = Lanes::new(simd, map, &packet);
             let hits = collide(&lanes, field, &mut reader.blocks, extinction, &mut random);
@@ -100,7 +100,10 @@ fn collide<'a, S: Simd>(
                 let cell = lanes.map.cells().get(places[lane] as usize).copied().unwrap_or(-1);
                 let is_real = cell >= SPECIAL || {
                     let corner = Vec3::new(place[0][lane], place[1][lane], place[2][lane]) * 8.0;
-                    let block = blocks.of_entry(cell as usize, || field.brick_at(corner));
+                    let block = match cell {
+                        BORDER => blocks.of_tile(field.brick_at(corner)),
+                        entry => blocks.of_entry(entry as usize, || field.brick_at(corner)),
+                    };
                     let position = Vec3::new(position[0][lane], position[1][lane], position[2][lane]);
                     random(lane) * tops[lane] < interpolate(block, position - corner)
                 };
@@ -111,8 +114,7 @@ fn collide<'a, S: Simd>(
             });
             (left, ends) = (f32x16::simd_from(simd, depths), f32x16::simd_from(simd, new_ends));
         }
-        for axis in 0..3 {
-            bricks[axis] = collides.select(bricks[axis], step.behind[axis]);
-        }
+        let along = |axis: usize| collides.select(bricks[axis], step.behind[axis]);
+        bricks = [along(0), along(1), along(2)];
     }
 }
