@@ -78,8 +78,8 @@ impl Camera {
             *length = 1.0 / length.sqrt();
         }
         let mut rays = [Ray { origin: self.origin, direction: self.forward }; N];
+        let [x, y, z] = &direction;
         for (i, ray) in rays.iter_mut().enumerate() {
-            let [x, y, z] = direction;
             ray.direction = DVec3::new(x[i], y[i], z[i]) * length[i];
         }
         rays

@@ -96,17 +96,20 @@ fn collide<'a, S: Simd>(
             let (places, tops) = (places.to_array(), tops.to_array());
             let (mut depths, mut new_ends) = (left.to_array(), ends.to_array());
             let at = t.to_array();
+            // All values before the first is asked for: they come from memory side by side.
+            let mut values = [f32::INFINITY; RAYS];
             each_bit(collided, |lane| {
-                let cell = lanes.map.cells().get(places[lane] as usize).copied().unwrap_or(-1);
-                let is_real = cell >= SPECIAL || {
-                    let corner = Vec3::new(place[0][lane], place[1][lane], place[2][lane]) * 8.0;
-                    let block = match cell {
-                        BORDER => blocks.of_tile(field.brick_at(corner)),
-                        entry => blocks.of_entry(entry as usize, || field.brick_at(corner)),
-                    };
-                    let position = Vec3::new(position[0][lane], position[1][lane], position[2][lane]);
-                    random(lane) * tops[lane] < interpolate(block, position - corner)
+                let corner = Vec3::new(place[0][lane], place[1][lane], place[2][lane]) * 8.0;
+                let block = match lanes.map.cells().get(places[lane] as usize).copied().unwrap_or(SPECIAL) {
+                    SPECIAL.. => return,
+                    BORDER => blocks.of_tile(field.brick_at(corner)),
+                    entry => blocks.of_entry(entry as usize, || field.brick_at(corner)),
                 };
+                let position = Vec3::new(position[0][lane], position[1][lane], position[2][lane]);
+                values[lane] = interpolate(block, position - corner);
+            });
+            each_bit(collided, |lane| {
+                let is_real = values[lane] == f32::INFINITY || random(lane) * tops[lane] < values[lane];
                 match is_real {
                     true => (hits[lane], new_ends[lane]) = (Some(at[lane]), 0.0),
                     false => depths[lane] = depth(random(lane)),
