@@ -14,7 +14,9 @@ use nuage_pipeline::import::{import, import_surface};
 use nuage_render::camera::{Camera, Ray};
 use nuage_render::filter::Filter;
 use nuage_render::hash::{hash_pixel, hash_u32, unit_f32};
-use nuage_render::packet::{RAYS, Surface, first_collisions, optical_depths, stepped_transmittances};
+use nuage_render::packet::{
+    RAYS, SIDE, Surface, first_collisions, optical_depths, square, stepped_transmittances,
+};
 use nuage_render::traverse::{Field, Reader};
 use nuage_volume::channel::Channel;
 use rayon::prelude::*;
@@ -23,8 +25,6 @@ use rayon::prelude::*;
 const EXTINCTION_PER_VOXEL: f64 = 0.1;
 const STEP_VOXELS: f32 = 0.5;
 const TILE: u32 = 16;
-/// Pixels of a packet along each axis.
-const SIDE: u32 = RAYS.isqrt() as u32;
 
 /// The channel of a file's first grid, and the value at its surface if it is a level set that is to be drawn.
 fn channel(path: &str, is_surface: bool) -> Result<(Channel, f32), Box<dyn Error>> {
@@ -44,17 +44,12 @@ type Tile = [f32; (TILE * TILE) as usize];
 fn pixels_of(tile: u32, packet: u32, size: u32) -> [[u32; 2]; RAYS] {
     let columns = size.div_ceil(TILE);
     let (left, top) = (tile % columns * TILE, tile / columns * TILE);
-    let (left, top) = (left + packet % SIDE * SIDE, top + packet / SIDE * SIDE);
-    std::array::from_fn(|i| [left + i as u32 % SIDE, top + i as u32 / SIDE])
+    let across = TILE / SIDE;
+    square(left + packet % across * SIDE, top + packet / across * SIDE)
 }
 
 /// Makes the tiles of a picture. Gives how many milliseconds it took.
-fn picture<'a>(
-    field: &Field<'a>,
-    size: u32,
-    kernel: &(dyn Fn(&mut Reader<'a>, [[u32; 2]; RAYS]) -> [f32; RAYS] + Sync),
-    tiles: &mut [Tile],
-) -> f64 {
+fn picture<'a>(field: &Field<'a>, size: u32, kernel: &Kernel<'_, 'a>, tiles: &mut [Tile]) -> f64 {
     let begin = Instant::now();
     tiles.par_iter_mut().enumerate().for_each_init(
         || field.reader(),
@@ -97,7 +92,8 @@ fn kernel_of<'r, 'a: 'r>(
     let filter = if matches!(kernel, "nearest" | "exact") { Filter::Nearest } else { Filter::Trilinear };
     Ok(match kernel {
         "nearest" | "trilinear" => Box::new(move |reader, pixels| {
-            let passes = stepped_transmittances(field, reader, &rays(&pixels), filter, STEP_VOXELS, extinction);
+            let passes =
+                stepped_transmittances(field, reader, &rays(&pixels), filter, STEP_VOXELS, extinction);
             passes.map(|passes| 1.0 - passes)
         }),
         "exact" | "cubic" => Box::new(move |reader, pixels| {
@@ -161,7 +157,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let mut tiles = vec![[0.0; (TILE * TILE) as usize]; size.div_ceil(TILE).pow(2) as usize];
     for turn in 0..=repeats {
         let cpu = cpu_ms();
-        let time = pool.install(|| picture(&field, size, &*kernel, &mut tiles));
+        let time = pool.install(|| picture(&field, size, &kernel, &mut tiles));
         if turn > 0 {
             times.push(time);
             cpu_times.push(cpu_ms() - cpu);

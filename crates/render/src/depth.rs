@@ -18,6 +18,7 @@ use crate::blocks::{Block, Blocks, SIDE};
 use crate::camera::Ray;
 use crate::filter::Filter;
 use crate::gather::{gather_f32, gather_u16};
+use crate::packet::MOST_STEPS;
 use crate::simd::{each_lane, level};
 use crate::traverse::{Field, LocalRay, Reader};
 use crate::walk::{BrickSpan, Sight, Slabs, SortedRay, SpanContent, Spans, with_spans};
@@ -98,7 +99,9 @@ impl Steps {
     fn of(field: &Field<'_>, ray: &Ray, shift_voxels: f64, step_voxels: f32) -> Option<Steps> {
         let entered = field.enter(ray, shift_voxels)?;
         let [start, end] = entered.interval;
-        let step = f64::from(step_voxels) / entered.voxels_per_length();
+        // Not so short that numbers of samples could not be told apart.
+        let least = (end - start) / MOST_STEPS;
+        let step = least.max(f64::from(step_voxels) / entered.voxels_per_length());
         let start = (start / step).ceil() * step;
         let ray = SortedRay::new(entered.local(start));
         Some(Steps { ray, length: (end - start) as f32, step: step as f32 })
@@ -587,52 +590,10 @@ impl<S: Simd> BrickRay<S> {
 
 #[cfg(test)]
 mod tests {
-    use glam::{DAffine3, DVec3, IVec3};
-    use nuage_volume::brick::{BrickSummary, f32_from_finite_f16};
-    use nuage_volume::build::{TileSize, TreeBuilder};
-    use nuage_volume::channel::{Channel, IndexBox};
-    use nuage_volume::space::BRICK_VOXELS;
+    use nuage_volume::brick::f32_from_finite_f16;
 
     use super::*;
-    use crate::hash::{hash_u32, unit_f32};
-
-    fn random(seed: u32) -> f32 {
-        unit_f32(hash_u32(seed))
-    }
-
-    /// Bricks here and there, some of one value, and a large tile beside them.
-    fn channel() -> Channel {
-        let mut builder = TreeBuilder::new();
-        let mut all = Vec::new();
-        builder.tile(IVec3::new(16, 0, 0), TileSize::Node4, 0.4).unwrap();
-        for i in 0..300 {
-            let brick = [1, 2, 3].map(|j| (random(i * 5 + j) * 16.0) as i32);
-            let brick = IVec3::from_array(brick);
-            let values: [f32; BRICK_VOXELS] = std::array::from_fn(|j| random(i * 512 + j as u32));
-            // Places that are taken already are left as they are.
-            if i % 9 == 0 {
-                let _ = builder.tile(brick, TileSize::Brick, 0.7);
-            } else if builder.brick(brick, BrickSummary::of(&values)).is_ok() {
-                all.extend(values);
-            }
-        }
-        let tree = builder.finish(Bricks::F32(all)).unwrap();
-        let active_box = Some(IndexBox { min: IVec3::ZERO, max: IVec3::new(255, 127, 127) });
-        Channel { tree, world_from_index: DAffine3::from_scale(DVec3::splat(0.1)), active_box }
-    }
-
-    fn rays() -> impl Iterator<Item = Ray> {
-        (0..200).map(|i| {
-            let point = |seed: u32| {
-                let [x, y, z] = [1, 2, 3].map(|j| f64::from(random(seed + j)));
-                DVec3::new(x * 26.0, y * 13.0, z * 13.0)
-            };
-            let (from, to) = (point(i * 50 + 7), point(i * 50 + 20));
-            let direction =
-                if i % 5 == 0 { DVec3::AXES[i as usize / 5 % 3] } else { (to - from).normalize() };
-            Ray { origin: from - direction * 40.0, direction }
-        })
-    }
+    use crate::fixtures::{channel, random, rays};
 
     #[test]
     fn all_levels_give_the_same_bits() {

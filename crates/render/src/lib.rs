@@ -20,6 +20,8 @@ pub mod depth;
 pub mod envmap;
 pub mod film;
 pub mod filter;
+#[cfg(test)]
+mod fixtures;
 pub mod framing;
 mod gather;
 pub mod hash;

@@ -10,6 +10,7 @@ use glam::DVec2;
 use crate::film::{Image, ImageSizeError, Tiling};
 use crate::hash::{hash_pixel, unit_f32};
 use crate::march::{Marcher, Quality, Worker};
+use crate::packet::{RAYS, SIDE, square};
 use crate::scene::Scene;
 
 /// Renders a scene by marching. The picture's alpha is 1 − transmittance; nothing stands behind the medium
@@ -61,6 +62,31 @@ pub(crate) fn each_pixel<W>(
         progress(done.fetch_add(1, Ordering::Relaxed) + 1, tiling.count());
     });
     tiling.rows(tiles)
+}
+
+/// What `packet` makes of each square of pixels, row by row as those of [`each_pixel`]. Squares at the right and at the bottom
+/// may reach beyond the picture.
+pub(crate) fn each_packet<W>(
+    [width, height]: [u32; 2],
+    worker: impl Fn() -> W + Sync + Send,
+    packet: impl Fn(&mut W, &[[u32; 2]; RAYS]) -> [[f32; 4]; RAYS] + Sync + Send,
+    progress: &(dyn Fn(u32, u32) + Sync),
+) -> Vec<[f32; 4]> {
+    let tiling = Tiling { width, height };
+    let mut tiles = vec![Vec::new(); tiling.count() as usize];
+    let done = AtomicU32::new(0);
+    each_tile(&mut tiles, worker, |worker, index, tile: &mut Vec<([u32; 2], [f32; 4])>| {
+        for [left, top] in tiling.pixels(index).filter(|pixel| pixel.iter().all(|at| at % SIDE == 0)) {
+            let pixels = square(left, top);
+            tile.extend(pixels.into_iter().zip(packet(worker, &pixels)));
+        }
+        progress(done.fetch_add(1, Ordering::Relaxed) + 1, tiling.count());
+    });
+    let mut all = vec![[0.0; 4]; width as usize * height as usize];
+    for ([x, y], pixel) in tiles.into_iter().flatten().filter(|([x, y], _)| *x < width && *y < height) {
+        all[y as usize * width as usize + x as usize] = pixel;
+    }
+    all
 }
 
 /// Does some work on every tile, on all cores. Each thread has a worker of its own.

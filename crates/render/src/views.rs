@@ -4,12 +4,12 @@
 use glam::DVec2;
 
 use crate::camera::{Camera, Ray};
-use crate::depth::optical_depth;
 use crate::film::{Image, ImageSizeError};
 use crate::filter::Filter;
 use crate::math::one_minus_exp_neg;
-use crate::picture::each_pixel;
-use crate::surface::{VoxelHit, first_hit, first_voxel};
+use crate::packet::{RAYS, Surface, optical_depths};
+use crate::picture::each_packet;
+use crate::surface::{VoxelHit, first_voxel};
 use crate::traverse::{Field, Reader};
 
 /// What a view shows of the voxels along a ray.
@@ -41,6 +41,8 @@ pub struct Viewer<'f, 'a> {
     /// The nearest and furthest distance of a voxel from the camera.
     distances: [f64; 2],
     largest: f32,
+    /// What a view of a surface shows.
+    surface: Option<Surface<'f, 'a>>,
 }
 
 impl<'f, 'a> Viewer<'f, 'a> {
@@ -52,25 +54,35 @@ impl<'f, 'a> Viewer<'f, 'a> {
         let radius = field.world_corners().map(|corner| (corner - centre).length());
         let radius = radius.into_iter().fold(0.0, f64::max);
         let nearest = ((centre - camera.origin).length() - radius).max(0.0);
-        Viewer { field, view, distances: [nearest, furthest], largest: field.tree().bounds().max }
+        let surface = match view {
+            View::Surface { level } => Some(Surface::new(field, level)),
+            _ => None,
+        };
+        let largest = field.tree().bounds().max;
+        Viewer { field, view, distances: [nearest, furthest], largest, surface }
     }
 
-    /// Colour and opacity, linear light, colours times opacity.
-    pub fn pixel(&self, reader: &mut Reader<'a>, ray: &Ray) -> [f32; 4] {
+    /// Colours and opacities, linear light, colours times opacity.
+    pub fn pixels(&self, reader: &mut Reader<'a>, rays: &[Ray; RAYS]) -> [[f32; 4]; RAYS] {
         if let View::Density { extinction } = self.view {
-            let depth = optical_depth(self.field, reader, ray, Filter::Trilinear);
-            return [one_minus_exp_neg(extinction * depth); 4];
+            let depths = optical_depths(self.field, reader, rays, Filter::Trilinear);
+            return depths.map(|depth| [one_minus_exp_neg(extinction * depth); 4]);
         }
-        if let View::Surface { level } = self.view {
-            let hit = first_hit(self.field, reader, ray, level);
-            return hit.map_or([0.0; 4], |hit| {
-                let facing = (-hit.normal.dot(ray.direction.as_vec3())).clamp(0.0, 1.0);
-                [facing, facing, facing, 1.0]
+        if let Some(surface) = &self.surface {
+            let hits = surface.first_hits(reader, rays);
+            return std::array::from_fn(|i| {
+                hits[i].map_or([0.0; 4], |hit| {
+                    let facing = (-hit.normal.dot(rays[i].direction.as_vec3())).clamp(0.0, 1.0);
+                    [facing, facing, facing, 1.0]
+                })
             });
         }
-        let Some(hit) = first_voxel(self.field, reader, ray, 0.0) else { return [0.0; 4] };
-        let [r, g, b] = self.colour(&hit);
-        [r, g, b, 1.0]
+        std::array::from_fn(|i| {
+            first_voxel(self.field, reader, &rays[i], 0.0).map_or([0.0; 4], |hit| {
+                let [r, g, b] = self.colour(&hit);
+                [r, g, b, 1.0]
+            })
+        })
     }
 
     fn colour(&self, hit: &VoxelHit) -> [f32; 3] {
@@ -118,10 +130,10 @@ pub fn render_view<'a>(
 ) -> Result<Image, ImageSizeError> {
     let mut image = Image::new(width, height)?;
     let viewer = Viewer::new(field, view, camera);
-    let pixel = |reader: &mut Reader<'a>, x: u32, y: u32| {
-        let ray = camera.ray(DVec2::new(x.into(), y.into()) + 0.5, width, height);
-        viewer.pixel(reader, &ray)
+    let packet = |reader: &mut Reader<'a>, pixels: &[[u32; 2]; RAYS]| {
+        let centres = pixels.map(|[x, y]| DVec2::new(x.into(), y.into()) + 0.5);
+        viewer.pixels(reader, &camera.rays(&centres, width, height))
     };
-    image.pixels = each_pixel([width, height], || field.reader(), pixel, progress);
+    image.pixels = each_packet([width, height], || field.reader(), packet, progress);
     Ok(image)
 }

@@ -35,7 +35,7 @@ pub fn stepped_transmittances<'a>(
     stepped_transmittances_at(level(), field, reader, rays, filter, step_voxels, extinction)
 }
 
-fn optical_depths_at<'a>(
+pub(super) fn optical_depths_at<'a>(
     level: Level,
     field: &Field<'a>,
     reader: &mut Reader<'a>,
@@ -60,7 +60,7 @@ fn optical_depths_at<'a>(
     ))
 }
 
-fn stepped_transmittances_at<'a>(
+pub(super) fn stepped_transmittances_at<'a>(
     level: Level,
     field: &Field<'a>,
     reader: &mut Reader<'a>,
@@ -72,7 +72,15 @@ fn stepped_transmittances_at<'a>(
     let (sight, shift) = sight_of(filter);
     let Some(map) = field.map(sight) else {
         return each_ray!(|lane| {
-            depth::stepped_transmittance_at(level, field, reader, &rays[lane], filter, step_voxels, extinction)
+            depth::stepped_transmittance_at(
+                level,
+                field,
+                reader,
+                &rays[lane],
+                filter,
+                step_voxels,
+                extinction,
+            )
         });
     };
     dispatch!(level, simd => simd.vectorize(
@@ -137,7 +145,11 @@ fn integrate_voxels<S: Simd, V: Stored>(lanes: &Lanes<'_, S>, values: &[V]) -> [
 }
 
 #[inline(always)]
-fn integrate_cells<'a, S: Simd>(lanes: &Lanes<'_, S>, field: &Field<'a>, blocks: &mut Blocks<'a>) -> [f32; RAYS] {
+fn integrate_cells<'a, S: Simd>(
+    lanes: &Lanes<'_, S>,
+    field: &Field<'a>,
+    blocks: &mut Blocks<'a>,
+) -> [f32; RAYS] {
     let (mut t, mut depth) = (lanes.splat(0.0), lanes.splat(0.0));
     let mut voxels = trunc(lanes.at(t));
     loop {
@@ -195,7 +207,7 @@ fn sample_cells<'a, S: Simd>(
                 passes *= one - inside.select(lost, zero);
                 number += inside.select(one, zero);
                 t_sample = number * steps;
-                inside = inside & t_sample.simd_lt(end);
+                inside &= t_sample.simd_lt(end);
             }
         }
         if is_empty.any_true() {

@@ -12,11 +12,11 @@
 use fearless_simd::{Simd, f32x16, i32x16, mask32x16, prelude::*};
 use glam::IVec3;
 
-use crate::blocks::{Blocks, SIDE};
+use crate::blocks::{self, Blocks};
 use crate::camera::Ray;
+use crate::depth::{NOWHERE, corners_at, corners_from};
 use crate::gather::{gather_f32, gather_i32};
 use crate::simd::each_lane;
-use crate::depth::{NOWHERE, corners_at, corners_from};
 use crate::traverse::Field;
 use crate::walk::{BORDER, BrickMap, SPECIAL};
 
@@ -30,6 +30,17 @@ pub use tracks::first_collisions;
 
 /// Rays of a packet.
 pub const RAYS: usize = 16;
+
+/// Pixels along each side of the square whose rays make a packet that finds much of what it reads together.
+pub const SIDE: u32 = 4;
+
+/// The pixels of such a square, row by row.
+pub fn square(left: u32, top: u32) -> [[u32; 2]; RAYS] {
+    each_ray!(|i| [left + i as u32 % SIDE, top + i as u32 / SIDE])
+}
+
+/// The most samples along a ray.
+pub(crate) const MOST_STEPS: f64 = 8e6;
 
 /// An array of what an expression gives for each ray of a packet; see `each_lane`.
 macro_rules! each_ray {
@@ -60,7 +71,12 @@ impl Packet {
     ///
     /// What [`Field::enter`] does, in loops over lanes without branches.
     #[inline(always)]
-    fn enter(field: &Field<'_>, rays: &[Ray; RAYS], shift_voxels: f64, step_voxels: Option<f32>) -> Option<Packet> {
+    fn enter(
+        field: &Field<'_>,
+        rays: &[Ray; RAYS],
+        shift_voxels: f64,
+        step_voxels: Option<f32>,
+    ) -> Option<Packet> {
         let (index_from_world, offset, [low, high]) = field.placement();
         let by_rows = index_from_world.transpose();
         let [mut origin, mut direction, mut inverse] = [[[0.0_f64; RAYS]; 3]; 3];
@@ -83,23 +99,28 @@ impl Packet {
                 (origin[axis][lane], direction[axis][lane], inverse[axis][lane]) = (o, d, i);
             }
         }
-        let mut any = false;
+        let (mut any, mut steps) = (false, [1.0; RAYS]);
         for lane in 0..RAYS {
-            let is_hit = starts[lane] < ends[lane];
+            let [x, y, z] = [direction[0][lane], direction[1][lane], direction[2][lane]];
+            let speed2 = x * x + y * y + z * z;
+            let [x, y, z] = [origin[0][lane], origin[1][lane], origin[2][lane]];
+            let distance2 = x * x + y * y + z * z;
+            let mut start = starts[lane];
+            if let Some(step_voxels) = step_voxels {
+                // No step is so short that numbers of samples could not be told apart.
+                let step = f64::from(step_voxels) / speed2.sqrt();
+                let least = (ends[lane] - start) / MOST_STEPS;
+                steps[lane] = if step > least { step } else { least };
+                start = (start / steps[lane]).ceil() * steps[lane];
+            }
+            // Numbers that single precision does not hold, or that are none, are no place to begin.
+            let makes_sense = speed2 > 1e-60 && speed2 < 1e60 && distance2 < 1e60;
+            let is_hit = makes_sense && start < ends[lane];
             any |= is_hit;
-            // Numbers without sense, such as infinite ones, are no place to begin.
-            (starts[lane], ends[lane]) = if is_hit { (starts[lane], ends[lane]) } else { (0.0, 0.0) };
+            (starts[lane], ends[lane]) = if is_hit { (start, ends[lane]) } else { (0.0, 0.0) };
         }
         if !any {
             return None;
-        }
-        let mut steps = [0.0; RAYS];
-        if let Some(step_voxels) = step_voxels {
-            for lane in 0..RAYS {
-                let [x, y, z] = [direction[0][lane], direction[1][lane], direction[2][lane]];
-                steps[lane] = f64::from(step_voxels) / (x * x + y * y + z * z).sqrt();
-                starts[lane] = (starts[lane] / steps[lane]).ceil() * steps[lane];
-            }
         }
         let mut packet = Packet {
             origin: [[0.0; RAYS]; 3],
@@ -266,7 +287,8 @@ impl<'m, S: Simd> Lanes<'m, S> {
         let along = |axis: usize| faces[axis] * 8.0;
         let leaving = self.leave([along(0), along(1), along(2)], t);
         let position = self.at(leaving.t);
-        let along = |axis: usize| self.inside(&leaving, axis, position[axis] * 0.125, bricks[axis], faces[axis]);
+        let along =
+            |axis: usize| self.inside(&leaving, axis, position[axis] * 0.125, bricks[axis], faces[axis]);
         Step { t: leaving.t, behind: [along(0), along(1), along(2)] }
     }
 
@@ -357,7 +379,10 @@ impl<'m, S: Simd> Lanes<'m, S> {
 }
 
 /// Where the corners of a cell stand in a block, from its first corner on.
-const CORNERS: [usize; 8] = [0, 1, SIDE, SIDE + 1, SIDE * SIDE, SIDE * SIDE + 1, SIDE * SIDE + SIDE, SIDE * SIDE + SIDE + 1];
+const CORNERS: [usize; 8] = {
+    let (y, x) = (blocks::SIDE, blocks::SIDE * blocks::SIDE);
+    [0, 1, y, y + 1, x, x + 1, x + y, x + y + 1]
+};
 
 /// The corners of cells whose brick is met for the first time, or is part of a tile.
 #[cold]
@@ -416,3 +441,6 @@ fn interpolate<S: Simd>(c: &[f32x16<S>; 8], [x, y, z]: [f32x16<S>; 3]) -> f32x16
     let high = mix(mix(c[4], c[5], z), mix(c[6], c[7], z), y);
     mix(low, high, x)
 }
+
+#[cfg(test)]
+mod tests;

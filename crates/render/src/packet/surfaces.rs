@@ -36,7 +36,7 @@ impl<'f, 'a> Surface<'f, 'a> {
         self.first_hits_at(level(), reader, rays)
     }
 
-    fn first_hits_at(
+    pub(super) fn first_hits_at(
         &self,
         level: Level,
         reader: &mut Reader<'a>,
@@ -106,12 +106,7 @@ struct Met<S: Simd> {
 }
 
 #[inline(always)]
-fn meet<'a, S: Simd>(
-    lanes: &Lanes<'_, S>,
-    field: &Field<'a>,
-    blocks: &mut Blocks<'a>,
-    level: f32,
-) -> Met<S> {
+fn meet<'a, S: Simd>(lanes: &Lanes<'_, S>, field: &Field<'a>, blocks: &mut Blocks<'a>, level: f32) -> Met<S> {
     let (zero, level) = (lanes.splat(0.0), lanes.splat(level));
     let mut met = Met { rays: 0, ends: [zero; 2], voxels: [zero; 3], corners: [zero; 8] };
     let (mut t, mut ends) = (zero, lanes.ends);

@@ -27,7 +27,7 @@ pub fn first_collisions<'a>(
     first_collisions_at(level(), field, reader, rays, extinction, random)
 }
 
-fn first_collisions_at<'a>(
+pub(super) fn first_collisions_at<'a>(
     level: Level,
     field: &Field<'a>,
     reader: &mut Reader<'a>,
@@ -36,7 +36,9 @@ fn first_collisions_at<'a>(
     mut random: impl FnMut(usize) -> f32,
 ) -> [Option<f64>; RAYS] {
     if field.map(Sight::Cells).is_none() {
-        return each_ray!(|lane| track::first_collision(field, reader, &rays[lane], extinction, || random(lane)));
+        return each_ray!(|lane| track::first_collision(field, reader, &rays[lane], extinction, || random(
+            lane
+        )));
     }
     dispatch!(level, simd => simd.vectorize(
         #[inline(always)]
