@@ -14,10 +14,9 @@ use std::time::Instant;
 use glam::{DAffine3, DVec2, DVec3, IVec3, Vec3};
 use half::f16;
 use nuage_render::camera::{Camera, Ray};
-use nuage_render::depth::{optical_depth, stepped_transmittance};
 use nuage_render::filter::Filter;
 use nuage_render::hash::{hash_u32, unit_f32};
-use nuage_render::track::first_collision;
+use nuage_render::packet::{RAYS, SIDE, first_collisions, optical_depths, square, stepped_transmittances};
 use nuage_render::traverse::{Field, Reader};
 use nuage_volume::accessor::Accessor;
 use nuage_volume::brick::{BrickSummary, Bricks};
@@ -95,21 +94,24 @@ fn cloud(resolution: i32) -> Result<Channel, Box<dyn Error>> {
     Ok(Channel { tree: builder.finish(Bricks::F16(all))?, world_from_index, active_box })
 }
 
-fn work<'a>(kernel: &str, field: &Field<'a>, reader: &mut Reader<'a>, ray: &Ray, seed: u32) -> f32 {
-    match kernel {
-        "nearest" => stepped_transmittance(field, reader, ray, Filter::Nearest, STEP_VOXELS, EXTINCTION),
-        "trilinear" => stepped_transmittance(field, reader, ray, Filter::Trilinear, STEP_VOXELS, EXTINCTION),
-        "exact" => optical_depth(field, reader, ray, Filter::Nearest),
-        "cubic" => optical_depth(field, reader, ray, Filter::Trilinear),
-        _ => {
-            let mut count = 0;
-            let random = || {
-                count += 1;
-                unit_f32(hash_u32(seed.wrapping_add(count)))
-            };
-            first_collision(field, reader, ray, EXTINCTION, random).map_or(0.0, |t| t as f32)
+fn work<'a>(kernel: &str, field: &Field<'a>, reader: &mut Reader<'a>, rays: &[Ray; RAYS], seed: u32) -> f32 {
+    let values = match kernel {
+        "nearest" => stepped_transmittances(field, reader, rays, Filter::Nearest, STEP_VOXELS, EXTINCTION),
+        "trilinear" => {
+            stepped_transmittances(field, reader, rays, Filter::Trilinear, STEP_VOXELS, EXTINCTION)
         }
-    }
+        "exact" => optical_depths(field, reader, rays, Filter::Nearest),
+        "cubic" => optical_depths(field, reader, rays, Filter::Trilinear),
+        _ => {
+            let mut counts = [0; RAYS];
+            let random = |ray: usize| {
+                counts[ray] += 1;
+                unit_f32(hash_u32(seed.wrapping_add(64 * ray as u32 + counts[ray])))
+            };
+            first_collisions(field, reader, rays, EXTINCTION, random).map(|t| t.map_or(0.0, |t| t as f32))
+        }
+    };
+    values.iter().sum()
 }
 
 /// What a ray meets: bricks that are not empty, its length in them in voxels, and the cells that it crosses there.
@@ -148,8 +150,8 @@ fn ray_ns<'a>(kernel: &str, field: &Field<'a>, rays: &[Ray]) -> f64 {
     let mut reader = field.reader();
     let mut round = || {
         let begin = Instant::now();
-        let sum: f32 =
-            rays.iter().zip(0..).map(|(ray, i)| work(kernel, field, &mut reader, ray, 64 * i)).sum();
+        let packets = rays.as_chunks::<RAYS>().0.iter().zip(0..);
+        let sum: f32 = packets.map(|(rays, i)| work(kernel, field, &mut reader, rays, 1024 * i)).sum();
         black_box(sum);
         begin.elapsed().as_secs_f64() * 1e9 / rays.len() as f64
     };
@@ -167,7 +169,10 @@ fn rays() -> Result<Vec<Ray>, Box<dyn Error>> {
     let pixel = |i: u32| {
         let (tile, i) = (i / (TILE * TILE), i % (TILE * TILE));
         let (left, top) = (tile % columns * TILE * EVERY, tile / columns * TILE * EVERY);
-        DVec2::new(f64::from(left + i % TILE) + 0.5, f64::from(top + i / TILE) + 0.5)
+        let packet = i / RAYS as u32;
+        let (left, top) = (left + packet % (TILE / SIDE) * SIDE, top + packet / (TILE / SIDE) * SIDE);
+        let [x, y] = square(left, top)[i as usize % RAYS];
+        DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5)
     };
     let count = (SIZE / EVERY).pow(2);
     Ok((0..count).map(|i| camera.ray(pixel(i), SIZE, SIZE)).collect())
