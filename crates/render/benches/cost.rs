@@ -285,7 +285,9 @@ fn main() -> Result<(), Box<dyn Error>> {
     );
     order_rows.iter().for_each(|row| println!("{row}"));
     if let Some(file) = plot_file {
-        std::fs::write(file, plot(&points))?;
+        // Cargo runs benchmarks in the folder of their package.
+        let root = concat!(env!("CARGO_MANIFEST_DIR"), "/../..");
+        std::fs::write(std::path::Path::new(root).join(file), plot(&points))?;
     }
     Ok(())
 }
