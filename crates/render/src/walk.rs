@@ -141,6 +141,10 @@ impl BrickMap {
         first: IVec3,
         last: IVec3,
     ) -> Option<BrickMap> {
+        // Places of voxels are whole numbers of 31 bits.
+        if accessor.tree().bricks.len() as i64 > MOST_CELLS {
+            return None;
+        }
         let mut map = match sight {
             Sight::Cells => BrickMap::of(first, last, |brick| cells_of(accessor, brick)),
             Sight::Voxels => return BrickMap::of(first, last, |brick| voxels_of(accessor, brick)),
