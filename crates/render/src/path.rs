@@ -22,6 +22,8 @@
 //! others. And of what a direction of scattering makes more likely to be found by the next collisions, the expected part is
 //! taken off, whose mean is 0 (`expected_later`).
 //!
+//! Where volumes have a coarser level, shadow rays and rays of scattered light read that, with its own majorants.
+//!
 //! What does not live here: pixels, threads, pictures ([`crate::picture`]).
 
 use glam::{DVec3, Vec3};
@@ -31,7 +33,7 @@ use crate::blocks::Blocks;
 use crate::camera::Ray;
 use crate::depth::optical_depth;
 use crate::envmap::EnvironmentMap;
-use crate::filter::Filter;
+use crate::filter::{Filter, Lookup};
 use crate::hash::{hash_u32, unit_f32};
 use crate::light::{Arriving, Light, Sky, Sun};
 use crate::math::{exp, ln};
@@ -50,11 +52,13 @@ pub struct PathSettings {
     /// Whether each collision looks with a ray of its own for a sky that is a picture. Else only paths that leave the medium
     /// see it, as they do skies of other kinds. The other lights can be seen in no other way.
     pub sky_rays: bool,
+    /// How values between voxels are looked up.
+    pub lookup: Lookup,
 }
 
 impl Default for PathSettings {
     fn default() -> Self {
-        PathSettings { max_scatterings: None, sky_rays: true }
+        PathSettings { max_scatterings: None, sky_rays: true, lookup: Lookup::Trilinear }
     }
 }
 
@@ -84,6 +88,8 @@ pub struct PathTracer<'s> {
     scene: &'s Scene<'s>,
     settings: PathSettings,
     media: Vec<Medium<'s>>,
+    /// What rays of scattered light meet, if that is not the same: some are coarser levels.
+    far: Option<Vec<Medium<'s>>>,
     glows: Vec<Glow<'s>>,
     /// Of each light that is a sun, if all media are grey.
     shades: Vec<Option<Shade>>,
@@ -115,9 +121,9 @@ enum Region<'s> {
 
 impl<'s> Region<'s> {
     /// `None` if it is nowhere.
-    fn new(shape: Shape<'s>) -> Option<Self> {
+    fn new(shape: Shape<'s>, lookup: Lookup) -> Option<Self> {
         match shape {
-            Shape::Grid(channel) => Some(Region::Field(Box::new(Field::new(channel)?))),
+            Shape::Grid(channel) => Some(Region::Field(Box::new(lookup.field(channel)?))),
             shape => Solid::new(shape).map(Region::Solid),
         }
     }
@@ -134,6 +140,7 @@ impl<'s> Region<'s> {
 pub struct PathWorker<'s> {
     /// Of each medium and each glow: solids need none.
     media: Vec<Option<Reader<'s>>>,
+    far: Vec<Option<Reader<'s>>>,
     glows: Vec<Option<Reader<'s>>>,
 }
 
@@ -176,6 +183,11 @@ impl Random {
     /// From 0 to less than 1.
     fn unit(&mut self) -> f32 {
         unit_f32(self.bits())
+    }
+
+    /// Three numbers from 0 to less than 1.
+    fn three(&mut self) -> [f32; 3] {
+        [self.unit(), self.unit(), self.unit()]
     }
 
     /// An optical depth at which a ray collides.
@@ -235,10 +247,11 @@ impl Carried {
 impl<'s> PathTracer<'s> {
     /// Makes a scene ready.
     pub fn new(scene: &'s Scene<'s>, settings: PathSettings) -> Self {
-        let medium = |volume: &'s Volume<'s>| {
+        let lookup = settings.lookup;
+        let medium = |volume: &'s Volume<'s>, shape: Shape<'s>| {
             let extinction = Vec3::from_array(volume.extinction);
             let scale = extinction.max_element();
-            let region = Region::new(volume.shape).filter(|_| scale > 0.0)?;
+            let region = Region::new(shape, lookup).filter(|_| scale > 0.0)?;
             let is_grey = extinction == Vec3::splat(scale);
             let shares = if is_grey { Vec3::ONE } else { extinction / scale };
             let albedo = Vec3::from_array(volume.albedo);
@@ -246,19 +259,26 @@ impl<'s> PathTracer<'s> {
         };
         let glow = |volume: &'s Volume<'s>| {
             let emission = volume.emission.as_ref()?;
-            let region = Region::new(emission.channel.map_or(volume.shape, Shape::Grid))?;
+            let region = Region::new(emission.channel.map_or(volume.shape, Shape::Grid), lookup)?;
             Some(Glow { region, spectrum: &emission.spectrum })
         };
-        let media: Vec<_> = scene.volumes.iter().filter_map(medium).collect();
+        let media: Vec<_> = scene.volumes.iter().filter_map(|volume| medium(volume, volume.shape)).collect();
+        let far = scene.volumes.iter().any(|volume| volume.coarse.is_some()).then(|| {
+            let coarse =
+                |volume: &'s Volume<'s>| medium(volume, volume.coarse.map_or(volume.shape, Shape::Grid));
+            scene.volumes.iter().filter_map(coarse).collect::<Vec<_>>()
+        });
         let glows = scene.volumes.iter().filter_map(glow).collect();
-        let shades = scene.lights.iter().map(|light| shade(light, &media)).collect();
-        PathTracer { scene, settings, media, glows, shades }
+        let shades = scene.lights.iter().map(|light| shade(light, far.as_ref().unwrap_or(&media))).collect();
+        PathTracer { scene, settings, media, far, glows, shades }
     }
 
     /// What a thread needs.
     pub fn worker(&self) -> PathWorker<'s> {
+        let readers = |media: &[Medium<'s>]| media.iter().map(|medium| medium.region.reader()).collect();
         PathWorker {
-            media: self.media.iter().map(|medium| medium.region.reader()).collect(),
+            media: readers(&self.media),
+            far: self.far.as_deref().map_or(Vec::new(), readers),
             glows: self.glows.iter().map(|glow| glow.region.reader()).collect(),
         }
     }
@@ -278,7 +298,8 @@ impl<'s> PathTracer<'s> {
         let mut scatterings = 0;
         loop {
             let emitted = if scatterings == 0 { &mut sample.emission } else { &mut sample.indirect };
-            let collision = self.fly(worker, &ray, &mut carried, emitted, &mut random);
+            let is_far = scatterings > 0 && self.far.is_some();
+            let collision = self.fly(worker, is_far, &ray, &mut carried, emitted, &mut random);
             let Some(Collision { distance, medium }) = collision else {
                 match scatterings {
                     0 => sample.passed = true,
@@ -404,18 +425,25 @@ impl<'s> PathTracer<'s> {
     fn fly<'t>(
         &'t self,
         worker: &mut PathWorker<'s>,
+        is_far: bool,
         ray: &Ray,
         carried: &mut Carried,
         emitted: &mut Vec3,
         random: &mut Random,
     ) -> Option<Collision<'t, 's>> {
-        let PathWorker { media, glows } = worker;
-        let (collision, told) = match (self.media.as_slice(), media.as_mut_slice()) {
-            ([medium @ Medium { region: Region::Field(field), is_grey: true, .. }], [Some(reader)]) => {
+        let PathWorker { media: readers, far: far_readers, glows } = worker;
+        let (media, readers) = match &self.far {
+            Some(far) if is_far => (far, far_readers),
+            _ => (&self.media, readers),
+        };
+        let (collision, told) = match (media.as_slice(), readers.as_mut_slice()) {
+            ([medium @ Medium { region: Region::Field(field), is_grey: true, .. }], [Some(reader)])
+                if self.settings.lookup == Lookup::Trilinear =>
+            {
                 let distance = first_collision(field, reader, ray, medium.scale, || random.unit());
                 (distance.map(|distance| Collision { distance, medium }), 0.0)
             }
-            _ => self.fly_among(media, glows, ray, carried, emitted, random),
+            _ => self.fly_among(media, readers, glows, ray, carried, emitted, random),
         };
         let end = collision.as_ref().map_or(f64::INFINITY, |collision| collision.distance);
         if !self.glows.is_empty() {
@@ -425,8 +453,13 @@ impl<'s> PathTracer<'s> {
     }
 
     /// As [`fly`](Self::fly), among any media; gives also how far emission has been counted.
+    #[expect(
+        clippy::too_many_arguments,
+        reason = "they are the parts of a worker and of a path that change on the way"
+    )]
     fn fly_among<'t>(
-        &'t self,
+        &self,
+        media: &'t [Medium<'s>],
         readers: &mut [Option<Reader<'s>>],
         glows: &mut [Option<Reader<'s>>],
         ray: &Ray,
@@ -435,7 +468,8 @@ impl<'s> PathTracer<'s> {
         random: &mut Random,
     ) -> (Option<Collision<'t, 's>>, f64) {
         let mut told = 0.0;
-        let media = self.media.iter().zip(readers);
+        let lookup = self.settings.lookup;
+        let media = media.iter().zip(readers);
         let mut fronts: Vec<Front<'_, 't, 's>> = media
             .filter_map(|(medium, reader)| Front::new(medium, reader.as_mut(), ray, carried.colours, random))
             .collect();
@@ -443,7 +477,7 @@ impl<'s> PathTracer<'s> {
             let nearest = fronts.iter_mut().min_by(|a, b| a.next.total_cmp(&b.next));
             let Some(front) = nearest.filter(|front| front.next < f64::INFINITY) else { return (None, told) };
             let distance = front.next;
-            let part = front.density_over_majorant();
+            let part = front.density_over_majorant(lookup, random);
             let is_real = if front.medium.is_grey {
                 part >= 1.0 || random.unit() < part
             } else {
@@ -472,7 +506,9 @@ impl<'s> PathTracer<'s> {
         worth: f32,
         random: &mut Random,
     ) -> Vec3 {
-        let Some(Shaded { passes, varies }) = shade else {
+        // A shadow ray that is uncertain itself would not do: it counts for many.
+        let (Some(Shaded { passes, varies }), Some(filter)) = (shade, self.settings.lookup.along_lines())
+        else {
             return self.transmittance(worker, ray, limit, random);
         };
         let chance = worth * (SHADE_EDGES * varies + SHADE_HALVES * passes * (1.0 - passes));
@@ -480,18 +516,15 @@ impl<'s> PathTracer<'s> {
         let mut light = passes;
         // What a shadow ray finds beside it has to count for all those that are not followed.
         if random.unit() < chance {
-            light += (self.exact_transmittance(worker, ray) - passes) / chance;
+            light += (self.exact_transmittance(worker, ray, filter) - passes) / chance;
         }
         Vec3::splat(light)
     }
 
-    /// The share of light that passes along a ray to its end, where all media are grey.
-    fn exact_transmittance(&self, worker: &mut PathWorker<'s>, ray: &Ray) -> f32 {
-        let media = self.media.iter().zip(&mut worker.media);
-        let depth = media.map(|(medium, reader)| match (&medium.region, reader) {
-            (Region::Field(field), Some(reader)) => {
-                medium.scale * optical_depth(field, reader, ray, Filter::Trilinear)
-            }
+    /// The share of light that passes along a ray to its end, where all media are grey and integrals have a closed form.
+    fn exact_transmittance(&self, worker: &mut PathWorker<'s>, ray: &Ray, filter: Filter) -> f32 {
+        let depth = self.far(worker).map(|(medium, reader)| match (&medium.region, reader) {
+            (Region::Field(field), Some(reader)) => medium.scale * optical_depth(field, reader, ray, filter),
             (Region::Solid(solid), _) => {
                 let length = solid.interval(ray).map_or(0.0, |[start, end]| end - start);
                 medium.scale * length as f32
@@ -501,18 +534,30 @@ impl<'s> PathTracer<'s> {
         exp(-depth.sum::<f32>())
     }
 
+    /// The media that rays of scattered light meet, with their readers.
+    fn far<'t, 'w>(
+        &'t self,
+        worker: &'w mut PathWorker<'s>,
+    ) -> impl Iterator<Item = (&'t Medium<'s>, &'w mut Option<Reader<'s>>)> {
+        match &self.far {
+            Some(far) => far.iter().zip(&mut worker.far),
+            None => self.media.iter().zip(&mut worker.media),
+        }
+    }
+
     /// A vector whose mean is the share of light that passes along a ray up to a distance.
     fn transmittance(&self, worker: &mut PathWorker<'s>, ray: &Ray, limit: f64, random: &mut Random) -> Vec3 {
         let mut passes = Vec3::ONE;
-        for (medium, reader) in self.media.iter().zip(&mut worker.media) {
+        let lookup = self.settings.lookup;
+        for (medium, reader) in self.far(worker) {
             passes *= match (&medium.region, reader) {
                 (Region::Field(field), Some(reader)) if medium.is_grey => {
-                    let [passes] = pass(field, reader, medium.scale, [1.0], ray, limit, random);
+                    let [passes] = pass(field, reader, lookup, medium.scale, [1.0], ray, limit, random);
                     Vec3::splat(passes)
                 }
                 (Region::Field(field), Some(reader)) => {
                     let shares = medium.shares.to_array();
-                    Vec3::from_array(pass(field, reader, medium.scale, shares, ray, limit, random))
+                    Vec3::from_array(pass(field, reader, lookup, medium.scale, shares, ray, limit, random))
                 }
                 (Region::Solid(solid), _) => match solid.interval(ray) {
                     Some([start, end]) => {
@@ -539,6 +584,8 @@ impl<'s> PathTracer<'s> {
         [from, to]: [f64; 2],
         random: &mut Random,
     ) -> Vec3 {
+        // What glows is not linear in what is looked up, so that a voxel at random would not do.
+        let lookup = self.settings.lookup.mean();
         let mut light = Vec3::ZERO;
         for (glow, reader) in self.glows.iter().zip(readers) {
             let cut = |[start, end]: [f64; 2]| [start.max(from), end.min(to)];
@@ -555,7 +602,8 @@ impl<'s> PathTracer<'s> {
                     while let Some(segment) = segments.next_segment() {
                         let length = segment.t1 - segment.t0;
                         let t = segment.t0 + random.unit() * length;
-                        light += glow.spectrum.radiance(field.sample(blocks, local.at(t))) * length;
+                        let value = field.look_up(blocks, local.at(t), lookup, || [0.0; 3]);
+                        light += glow.spectrum.radiance(value) * length;
                     }
                 }
                 (Region::Solid(solid), _) => {
@@ -572,9 +620,14 @@ impl<'s> PathTracer<'s> {
 /// A number whose mean is the share of light that passes along a ray through a field up to a distance, for each of some
 /// colours, whose extinctions are `shares` of `scale`. By residual ratio tracking: what the least extinction of a segment
 /// takes away is known, only the rest is left to chance.
+#[expect(
+    clippy::too_many_arguments,
+    reason = "a medium in its parts, as colours are only known to the caller"
+)]
 fn pass<'s, const COLOURS: usize>(
     field: &Field<'s>,
     reader: &mut Reader<'s>,
+    lookup: Lookup,
     scale: f32,
     shares: [f32; COLOURS],
     ray: &Ray,
@@ -605,7 +658,8 @@ fn pass<'s, const COLOURS: usize>(
                 break;
             }
             t += depth / (residual * scale);
-            let part = (field.sample(blocks, local.at(t)) - segment.min) / residual;
+            let value = field.look_up(blocks, local.at(t), lookup, || random.three());
+            let part = (value - segment.min) / residual;
             for (ratio, share) in ratio.iter_mut().zip(shares) {
                 *ratio *= (1.0 - part * share).max(0.0);
             }
@@ -753,7 +807,7 @@ impl<'r, 't, 's> Front<'r, 't, 's> {
     }
 
     /// The density at the tentative collision as a share of the majorant.
-    fn density_over_majorant(&mut self) -> f32 {
+    fn density_over_majorant(&mut self, lookup: Lookup, random: &mut Random) -> f32 {
         match &mut self.place {
             Place::Solid { .. } => 1.0,
             Place::Field { segment, .. }
@@ -762,7 +816,8 @@ impl<'r, 't, 's> Front<'r, 't, 's> {
                 1.0
             }
             Place::Field { field, blocks, local, segment, t, .. } => {
-                (field.sample(blocks, local.at(*t)) / segment.max).min(1.0)
+                let value = field.look_up(blocks, local.at(*t), lookup, || random.three());
+                (value / segment.max).min(1.0)
             }
         }
     }

@@ -28,6 +28,7 @@ fn scene(density: &Channel) -> Scene<'_> {
     let emission = Emission { channel: None, spectrum: Spectrum::Linear { rgb: [0.1, 0.05, 0.02] } };
     let volume = Volume {
         shape: Shape::Grid(density),
+        coarse: None,
         extinction: [0.3; 3],
         albedo: [0.9, 0.8, 0.7],
         phase: Phase::HenyeyGreenstein { g: 0.3 },

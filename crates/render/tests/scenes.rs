@@ -75,7 +75,7 @@ fn cube(min: DVec3, max: DVec3) -> Shape<'static> {
 
 fn medium(shape: Shape<'_>, extinction: [f32; 3], g: f32) -> Volume<'_> {
     let phase = Phase::HenyeyGreenstein { g };
-    Volume { shape, extinction, albedo: [0.9, 0.6, 0.3], phase, emission: None }
+    Volume { shape, coarse: None, extinction, albedo: [0.9, 0.6, 0.3], phase, emission: None }
 }
 
 fn sun() -> Light {
