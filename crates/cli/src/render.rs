@@ -179,12 +179,6 @@ pub(crate) fn run(args: &Args, given: &Given) -> Result<(), Failure> {
     if run.timing {
         note(&shot.describe());
     }
-    if shot.plan().look.lod > 0 {
-        let lod = shot.plan().look.lod;
-        note(&format!(
-            "nuage: lod {lod}: shadows and scattered light come from a coarser level and are a little wrong"
-        ));
-    }
     if let Some(path) = &args.save_scene {
         let text = scene_file::save(shot.plan(), &run, path.parent().unwrap_or(Path::new("")));
         write_whole(path, text.as_bytes(), run.overwrite).map_err(|e| plain(path, e))?;

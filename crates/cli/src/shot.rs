@@ -287,6 +287,10 @@ impl Shot {
                 }
             };
         }
+        match self.plan.look.lod {
+            0 => {}
+            lod => text += &format!(" --lod {lod} (shadows and scattered light are a little wrong)"),
+        }
         text
     }
 
