@@ -12,6 +12,7 @@ use nuage_render::hash::{hash_u32, unit_f32};
 use nuage_render::light::{Light, Sky, Sun};
 use nuage_render::march::{Marcher, Quality};
 use nuage_render::path::{PathSettings, PathTracer};
+use nuage_render::sampler::Sampler;
 use nuage_render::scene::{Phase, Scene, Shape, Volume};
 use nuage_volume::channel::Channel;
 
@@ -73,7 +74,8 @@ fn integral(ray: &Ray, lookup: Lookup) -> f64 {
 fn share_that_passes(scene: &Scene<'_>, lookup: Lookup, ray: &Ray, paths: u32) -> f64 {
     let tracer = PathTracer::new(scene, PathSettings { lookup, ..PathSettings::default() });
     let mut worker = tracer.worker();
-    let passed = (0..paths).filter(|i| tracer.sample(&mut worker, ray, hash_u32(*i)).passed).count();
+    let passed =
+        (0..paths).filter(|i| tracer.sample(&mut worker, ray, Sampler::new(0, 0, *i, 0)).passed).count();
     passed as f64 / f64::from(paths)
 }
 
@@ -157,8 +159,8 @@ fn traced(scene: &Scene<'_>, lookup: Lookup, paths: u32) -> [f64; 2] {
     let (mut sum, mut squares, mut count) = (0.0, 0.0, 0.0);
     for (pixel, ray) in (0..).zip(rays(scene)) {
         for i in 0..paths {
-            let seed = hash_u32(pixel * paths + i) ^ hash_u32(lookup as u32 + 77);
-            let light = f64::from(tracer.sample(&mut worker, &ray, seed).light().y);
+            let numbers = Sampler::new(pixel, 0, i, lookup as u32);
+            let light = f64::from(tracer.sample(&mut worker, &ray, numbers).light().y);
             (sum, squares, count) = (sum + light, squares + light * light, count + 1.0);
         }
     }
