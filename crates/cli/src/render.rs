@@ -19,7 +19,7 @@ use nuage_volume::channel::IndexBox;
 use crate::denoise;
 use crate::error::Failure;
 use crate::frames;
-use crate::look::{Integrator, Look, View};
+use crate::look::{Filter, Integrator, Look, View};
 use crate::plan::{Given, Plan, SkyPlan, VolumePlan, What};
 use crate::progress;
 use crate::scene_file::{self, RunKeys};
@@ -239,6 +239,9 @@ fn check(look: &Look, run: &RunKeys, output: &Path) -> Result<(), String> {
     if look.view.is_some() && look.integrator == Integrator::Path {
         return Err("--view shows no light: leave out --integrator path".into());
     }
+    if look.view.is_some() && (look.lod > 0 || look.filter != Filter::default()) {
+        return Err("--view shows voxels as they are: leave out --lod and --filter".into());
+    }
     if let Some((name, _)) = of_paths.iter().find(|(_, is_asked)| *is_asked)
         && look.integrator != Integrator::Path
     {
@@ -322,10 +325,13 @@ fn render_frame(
     progress: &(dyn Fn(u32, u32) + Sync),
 ) -> Result<(), Failure> {
     let start = Instant::now();
-    let volumes = match loaded {
+    let mut volumes = match loaded {
         Some(volumes) => volumes,
         None => load(shot.plan(), &job.inputs, true)?,
     };
+    for volume in volumes.iter_mut().flatten() {
+        volume.coarsen(shot.plan().look.lod).map_err(Failure::Usage)?;
+    }
     let volumes: Vec<Option<&Volume>> = volumes.iter().map(Option::as_ref).collect();
     if let Some(what) = shot.unsupported(&volumes) {
         return Err(Failure::Usage(what));

@@ -16,6 +16,7 @@ use nuage_render::envmap::{self, EnvironmentMap};
 use nuage_render::film::{Film, Image, ImageSizeError};
 use nuage_render::framing::{self, WorldBox};
 use nuage_render::light::{Light, Sky, Sun};
+use nuage_render::lod;
 use nuage_render::march::{self, Quality};
 use nuage_render::path::PathSettings;
 use nuage_render::picture;
@@ -37,6 +38,8 @@ const REFERENCE_KELVIN: f32 = 1500.0;
 /// The channels of one frame.
 pub(crate) struct Volume {
     pub(crate) density: Channel,
+    /// A coarser level of it, if one was asked for.
+    pub(crate) coarse: Option<Channel>,
     pub(crate) emission: Option<Channel>,
     /// The value at the surface, if the density is a level set to be drawn as one.
     pub(crate) surface: Option<f32>,
@@ -47,6 +50,16 @@ impl Volume {
     pub(crate) fn world_box(&self) -> Option<WorldBox> {
         let channels = [Some(&self.density), self.emission.as_ref()].into_iter().flatten();
         channels.filter_map(WorldBox::of).reduce(WorldBox::union)
+    }
+
+    /// Makes a level with `1/2^levels` of the voxels per axis beside the density.
+    ///
+    /// # Errors
+    /// If that has too many tiles, in words.
+    pub(crate) fn coarsen(&mut self, levels: u32) -> Result<(), String> {
+        let coarse = lod::coarser_by(&self.density, levels);
+        self.coarse = coarse.map_err(|e| format!("--lod {levels} is too much: {e}"))?;
+        Ok(())
     }
 
     /// Moves it.
@@ -102,7 +115,10 @@ pub(crate) fn load<S: Source>(
     look: &Look,
     warn: &mut dyn FnMut(String),
 ) -> Result<Volume, String> {
-    load_grids(file, grid, look.temperature.as_deref().or(look.flame.as_deref()), look.view, warn)
+    let glowing = look.temperature.as_deref().or(look.flame.as_deref());
+    let mut volume = load_grids(file, grid, glowing, look.view, warn)?;
+    volume.coarsen(look.lod)?;
+    Ok(volume)
 }
 
 /// As [`load`], by the names of the density grid and of the grid that glows.
@@ -133,7 +149,7 @@ pub(crate) fn load_grids<S: Source>(
             return Err(format!("grid '{name}' is no level set: --view surface has nothing to show"));
         }
         let (density, level) = import::import_surface(grid).map_err(|e| e.to_string())?;
-        return Ok(Volume { density, emission: None, surface: Some(level) });
+        return Ok(Volume { density, coarse: None, emission: None, surface: Some(level) });
     }
     let mut read = |index: usize| -> Result<Channel, String> {
         let grid = file.read_grid(index).map_err(|e| explain(&e))?;
@@ -144,7 +160,8 @@ pub(crate) fn load_grids<S: Source>(
         }
         Ok(channel)
     };
-    Ok(Volume { density: read(density)?, emission: emission.map(read).transpose()?, surface: None })
+    let (density, emission) = (read(density)?, emission.map(read).transpose()?);
+    Ok(Volume { density, coarse: None, emission, surface: None })
 }
 
 fn messages(name: &str, report: &Report, channel: &Channel) -> Vec<String> {
@@ -270,6 +287,10 @@ impl Shot {
                 }
             };
         }
+        match self.plan.look.lod {
+            0 => {}
+            lod => text += &format!(" --lod {lod} (shadows and scattered light are a little wrong)"),
+        }
         text
     }
 
@@ -291,7 +312,8 @@ impl Shot {
                 PhasePlan::Draine([g, alpha]) => Phase::Draine { g, alpha },
                 PhasePlan::Droplets(diameter_um) => Phase::mie(diameter_um),
             };
-            Some(scene::Volume { shape, extinction, albedo: plan.albedo, phase, emission })
+            let coarse = loaded.and_then(|volume| volume.coarse.as_ref());
+            Some(scene::Volume { shape, coarse, extinction, albedo: plan.albedo, phase, emission })
         });
         let z_up = z_is_up(look);
         let lights = self.plan.lights.iter().filter_map(|light| match *light {
@@ -407,7 +429,11 @@ impl Shot {
     fn paths(&self) -> progressive::Plan {
         let look = &self.plan.look;
         progressive::Plan {
-            settings: PathSettings { max_scatterings: look.scatterings, sky_rays: !look.no_sky_rays },
+            settings: PathSettings {
+                max_scatterings: look.scatterings,
+                sky_rays: !look.no_sky_rays,
+                lookup: look.filter.lookup(),
+            },
             seed: look.seed,
             pass_samples: 1,
             samples: look.paths(),
@@ -430,6 +456,7 @@ impl Shot {
             sun_rays: look.sun_rays,
             sky_rays: look.sky_rays,
             samples: look.samples.unwrap_or(1),
+            lookup: look.filter.lookup(),
         };
         let Size { width, height } = look.size;
         let image = match look.integrator {

@@ -138,7 +138,7 @@ fn transmittance_and_emission_follow_the_quadrature() {
     let counted: Vec<f64> =
         through.iter().map(|share| (share * (1.0 - share) / 72.0).max(0.0).sqrt()).collect();
     holds("het64_trans", 6, "12", &through, &counted);
-    holds("emission", 6, "12", &colours("emit_box4x4.f64", [6.0, 2.5, 0.8]), &exact);
+    holds("emission", 8, "20", &colours("emit_box4x4.f64", [6.0, 2.5, 0.8]), &exact);
 }
 
 /// Nothing is lost in a medium that absorbs nothing: it cannot be seen before a sky of the same light.
@@ -166,10 +166,12 @@ fn a_saved_scene_gives_the_same_bytes() {
     let small = "--size 20x16 --step 2 --shadow-step 4 --sun-rays 4 --sky-rays 1";
     let small = &small.split_whitespace().collect::<Vec<_>>()[..];
     let input = blast("blast.####.vdb");
-    let marched =
-        format!("{input} -o {} --frames 3,9 --up z --flame flame --sun 0.3,1,0.7", at("a.####.exr"));
+    let marched = format!(
+        "{input} -o {} --frames 3,9 --up z --flame flame --sun 0.3,1,0.7 --filter tricubic",
+        at("a.####.exr")
+    );
     let traced = format!(
-        "{} -o {} --up 0.1,0,1 --temperature temperature --integrator path",
+        "{} -o {} --up 0.1,0,1 --temperature temperature --integrator path --lod 1 --filter stochastic-trilinear",
         blast("blast.0009.vdb"),
         at("b.exr")
     );
@@ -260,6 +262,45 @@ fn a_picture_of_an_even_sky_is_an_even_sky() {
     fails(&["--scene", &at("c.toml"), "-o", &at("y.exr")], 1, "c.toml");
 }
 
+/// Each filter and each level makes a picture of its own, in both renderers; and the picture says what it was made with.
+#[test]
+fn filters_and_levels_are_seen_and_said() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name).display().to_string();
+    let input = blast("blast.0009.vdb");
+    let own = ["--size", "24x24", "--up", "z", "--exr-float", "--overwrite"];
+    for integrator in ["march", "path"] {
+        let mut seen: Vec<Vec<u8>> = Vec::new();
+        let options = [
+            "--lod 0",
+            "--lod 1",
+            "--lod 2",
+            "--filter nearest",
+            "--filter tricubic",
+            "--filter stochastic-trilinear",
+            "--filter stochastic-tricubic",
+        ];
+        for options in options {
+            let output = at("x.exr");
+            let options: Vec<&str> = options.split_whitespace().collect();
+            let start = [&input, "-o", &output, "--integrator", integrator];
+            done(&[&start[..], &own, &options].concat());
+            let picture = fs::read(&output).unwrap();
+            assert!(!seen.contains(&picture), "{integrator} {options:?}");
+            seen.push(picture);
+        }
+    }
+    let output = at("layers.exr");
+    let traced = ["--integrator", "path", "--aovs", "--samples", "1", "--lod", "2", "--filter", "tricubic"];
+    done(&[&[input.as_str(), "-o", &output][..], &own, &traced].concat());
+    let head = String::from_utf8_lossy(&fs::read(&output).unwrap()).into_owned();
+    assert!(head.contains("\nlod = 2\n") && head.contains("\nfilter = \"tricubic\"\n"));
+    for options in [["--lod", "1"], ["--filter", "nearest"]] {
+        let view = [&input, "-o", &at("view.exr"), "--view", "depth"];
+        fails(&[&view[..], &options].concat(), 2, "leave out --lod and --filter");
+    }
+}
+
 #[test]
 fn options_overrule_the_file() {
     let folder = tempfile::tempdir().unwrap();
@@ -317,6 +358,8 @@ fn what_is_wrong_with_a_file_is_said_with_its_place() {
         ("[film]\nsize = [70000, 70000]\n", "line 2, column 8: size"),
         ("[film]\nsize = true\n", "line 2, column 8: size: a number"),
         ("[integrator]\nkind = \"magic\"\n", "line 2, column 8: kind: 'march' or 'path'"),
+        ("[integrator]\nfilter = \"soft\"\n", "line 2, column 10: filter: 'nearest', 'trilinear'"),
+        ("[integrator]\nlod = 13\n", "line 2, column 7: lod: a whole number from 0 to 12"),
         ("[integrator]\nsamples = -1\n", "line 2, column 11: samples: a whole number from 1"),
         ("[output]\nframes = \"x\"\n", "line 2, column 10: frames"),
         ("[output]\nthreads = 0\n", "line 2, column 11: threads"),

@@ -7,6 +7,10 @@
 //! Line integrals through filtered values are in [`depth`](crate::depth).
 
 use glam::{IVec3, Vec3};
+use nuage_volume::channel::Channel;
+
+use crate::blocks::Blocks;
+use crate::traverse::Field;
 
 /// How a value is made of the voxels around a point, for [`depth`](crate::depth).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -15,6 +19,93 @@ pub enum Filter {
     Nearest,
     /// [`trilinear`].
     Trilinear,
+}
+
+/// How a renderer looks up the value at a point.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum Lookup {
+    /// [`nearest`].
+    Nearest,
+    /// [`trilinear`], the fastest to track.
+    #[default]
+    Trilinear,
+    /// [`tricubic`], whose bounds are wider.
+    Tricubic,
+    /// One voxel at random, which is [`trilinear`] in the mean.
+    StochasticTrilinear,
+    /// One voxel at random, which is [`tricubic`] in the mean.
+    StochasticTricubic,
+}
+
+impl Lookup {
+    /// What it is in the mean.
+    #[must_use]
+    pub fn mean(self) -> Self {
+        match self {
+            Lookup::StochasticTrilinear => Lookup::Trilinear,
+            Lookup::StochasticTricubic => Lookup::Tricubic,
+            exact => exact,
+        }
+    }
+
+    /// The filter whose line integrals, in the mean, have a closed form.
+    pub(crate) fn along_lines(self) -> Option<Filter> {
+        match self.mean() {
+            Lookup::Nearest => Some(Filter::Nearest),
+            Lookup::Trilinear => Some(Filter::Trilinear),
+            _ => None,
+        }
+    }
+
+    /// A channel made ready for rays that look values up so.
+    pub(crate) fn field(self, channel: &Channel) -> Option<Field<'_>> {
+        match self.mean() {
+            Lookup::Tricubic => Field::wide(channel),
+            _ => Field::new(channel),
+        }
+    }
+}
+
+impl<'a> Field<'a> {
+    /// The value at a position. `random` gives three numbers from 0 to less than 1, if one voxel is to be chosen.
+    #[inline]
+    pub(crate) fn look_up(
+        &self,
+        blocks: &mut Blocks<'a>,
+        position: Vec3,
+        lookup: Lookup,
+        random: impl FnOnce() -> [f32; 3],
+    ) -> f32 {
+        let mut voxel = |voxel: IVec3| blocks.trilinear_in_cell(self.voxel_at(voxel.as_vec3()), Vec3::ZERO);
+        match lookup {
+            Lookup::Trilinear => self.sample(blocks, position),
+            Lookup::Nearest => voxel(nearest_voxel(position)),
+            Lookup::StochasticTrilinear => voxel(trilinear_voxel(position, random())),
+            Lookup::StochasticTricubic => voxel(tricubic_voxel(position, random())),
+            Lookup::Tricubic => tricubic_of_linear(position, |cell, fraction| {
+                blocks.trilinear_in_cell(self.voxel_at(cell), fraction)
+            }),
+        }
+    }
+}
+
+/// [`tricubic`] by eight trilinear samples, each at the place between two voxels along each axis that has their weights (Sigg &
+/// Hadwiger, "Fast Third-Order Texture Filtering", GPU Gems 2, 2005). `linear` gives the sample of a cell, by its lower corner.
+fn tricubic_of_linear(p_index: Vec3, mut linear: impl FnMut(Vec3, Vec3) -> f32) -> f32 {
+    let cell = p_index.floor();
+    let pairs = (p_index - cell).to_array().map(|x| {
+        let [a, b, c, d] = cubic_weights(x);
+        [(a + b, b / (a + b)), (c + d, d / (c + d))]
+    });
+    let mut sum = 0.0;
+    for i in 0..8_usize {
+        let halves = [i >> 2, i >> 1 & 1, i & 1];
+        let along = |axis: usize| pairs[axis][halves[axis]];
+        let corner = cell + Vec3::from(halves.map(|half| if half == 0 { -1.0 } else { 1.0 }));
+        let weight: f32 = (0..3).map(|axis| along(axis).0).product();
+        sum += weight * linear(corner, Vec3::from([0, 1, 2].map(|axis| along(axis).1)));
+    }
+    sum
 }
 
 /// The voxel at `floor(p + ½)`.
@@ -131,6 +222,15 @@ mod tests {
             for filtered in [trilinear(p, |v| plane(v.as_vec3())), tricubic(p, |v| plane(v.as_vec3()))] {
                 assert!((filtered - plane(p)).abs() < 1e-4, "{p}: {filtered} instead of {}", plane(p));
             }
+        }
+    }
+
+    #[test]
+    fn eight_linear_samples_make_the_spline() {
+        for p in points(300) {
+            let linear = |cell: Vec3, fraction: Vec3| trilinear(cell + fraction, noise);
+            let (found, expected) = (tricubic_of_linear(p, linear), tricubic(p, noise));
+            assert!((found - expected).abs() < 1e-5, "{p}: {found} instead of {expected}");
         }
     }
 

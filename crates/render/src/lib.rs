@@ -2,7 +2,8 @@
 //!
 //! [`scene`] says what is rendered, [`light`] what lights it, and [`camera`] from where; [`traverse`] walks rays through the packed tree;
 //! [`blocks`] keeps
-//! decoded bricks; [`packet`] follows sixteen rays at once; [`march`] integrates light along them; [`path`] follows it through any number of scatterings;
+//! decoded bricks, [`lod`] makes coarser levels; [`packet`] follows sixteen rays at once; [`march`] integrates light along them;
+//! [`path`] follows it through any number of scatterings;
 //! [`picture`] runs both over all pixels, and [`progressive`] paths in passes, until a picture is good enough;
 //! [`checkpoint`] keeps one that is not; [`framing`] finds views and
 //! densities for volumes that nobody described; [`film`] and [`output`] hold and encode pictures. Physics in
@@ -26,6 +27,7 @@ pub mod framing;
 mod gather;
 pub mod hash;
 pub mod light;
+pub mod lod;
 pub mod march;
 pub mod math;
 pub mod output;

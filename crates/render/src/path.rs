@@ -22,6 +22,11 @@
 //! others. And of what a direction of scattering makes more likely to be found by the next collisions, the expected part is
 //! taken off, whose mean is 0 (`expected_later`).
 //!
+//! The first few scatterings of a path take numbers that are spread evenly over the paths of a pixel ([`sampler`](crate::sampler)):
+//! which way it goes, whether a shadow ray looks, how far it goes next. All others are random.
+//!
+//! Where volumes have a coarser level, shadow rays and rays of scattered light read that, with its own majorants.
+//!
 //! What does not live here: pixels, threads, pictures ([`crate::picture`]).
 
 use glam::{DVec3, Vec3};
@@ -31,11 +36,11 @@ use crate::blocks::Blocks;
 use crate::camera::Ray;
 use crate::depth::optical_depth;
 use crate::envmap::EnvironmentMap;
-use crate::filter::Filter;
-use crate::hash::{hash_u32, unit_f32};
+use crate::filter::{Filter, Lookup};
 use crate::light::{Arriving, Light, Sky, Sun};
 use crate::math::{exp, ln};
 use crate::phase::MAX_ASYMMETRY;
+use crate::sampler::Sampler;
 use crate::scene::{Phase, Scene, Shape, Spectrum, Volume};
 use crate::shade::{Caster, Shade, Shaded};
 use crate::solid::Solid;
@@ -50,11 +55,13 @@ pub struct PathSettings {
     /// Whether each collision looks with a ray of its own for a sky that is a picture. Else only paths that leave the medium
     /// see it, as they do skies of other kinds. The other lights can be seen in no other way.
     pub sky_rays: bool,
+    /// How values between voxels are looked up.
+    pub lookup: Lookup,
 }
 
 impl Default for PathSettings {
     fn default() -> Self {
-        PathSettings { max_scatterings: None, sky_rays: true }
+        PathSettings { max_scatterings: None, sky_rays: true, lookup: Lookup::Trilinear }
     }
 }
 
@@ -84,6 +91,8 @@ pub struct PathTracer<'s> {
     scene: &'s Scene<'s>,
     settings: PathSettings,
     media: Vec<Medium<'s>>,
+    /// What rays of scattered light meet, if that is not the same: some are coarser levels.
+    far: Option<Vec<Medium<'s>>>,
     glows: Vec<Glow<'s>>,
     /// Of each light that is a sun, if all media are grey.
     shades: Vec<Option<Shade>>,
@@ -115,9 +124,9 @@ enum Region<'s> {
 
 impl<'s> Region<'s> {
     /// `None` if it is nowhere.
-    fn new(shape: Shape<'s>) -> Option<Self> {
+    fn new(shape: Shape<'s>, lookup: Lookup) -> Option<Self> {
         match shape {
-            Shape::Grid(channel) => Some(Region::Field(Box::new(Field::new(channel)?))),
+            Shape::Grid(channel) => Some(Region::Field(Box::new(lookup.field(channel)?))),
             shape => Solid::new(shape).map(Region::Solid),
         }
     }
@@ -134,6 +143,7 @@ impl<'s> Region<'s> {
 pub struct PathWorker<'s> {
     /// Of each medium and each glow: solids need none.
     media: Vec<Option<Reader<'s>>>,
+    far: Vec<Option<Reader<'s>>>,
     glows: Vec<Option<Reader<'s>>>,
 }
 
@@ -161,28 +171,10 @@ impl PathSample {
     }
 }
 
-/// Random numbers of one path.
-struct Random {
-    path: u32,
-    count: u32,
-}
-
-impl Random {
-    fn bits(&mut self) -> u32 {
-        self.count = self.count.wrapping_add(1);
-        hash_u32(hash_u32(self.path.wrapping_add(self.count)) ^ self.path.rotate_left(16))
-    }
-
-    /// From 0 to less than 1.
-    fn unit(&mut self) -> f32 {
-        unit_f32(self.bits())
-    }
-
-    /// An optical depth at which a ray collides.
-    fn depth(&mut self) -> f32 {
-        // Never infinite: the number is less than 1 by 2⁻²⁴ or more.
-        -ln(1.0 - self.unit())
-    }
+/// An optical depth at which a ray collides, by a number from 0 to less than 1.
+fn depth_of(number: f32) -> f32 {
+    // Never infinite: the number is less than 1 by 2⁻²⁴ or more.
+    -ln(1.0 - number)
 }
 
 /// Where a path collides.
@@ -217,10 +209,10 @@ impl Carried {
     }
 
     /// Takes one of two turns, `part` for a colour being its chance there. Gives whether it is that one.
-    fn turns(&mut self, part: Vec3, random: &mut Random) -> bool {
+    fn turns(&mut self, part: Vec3, numbers: &mut Sampler) -> bool {
         let taken = self.colours * part;
         let chance = taken.element_sum() / 3.0;
-        let (is_taken, left, chance) = match random.unit() < chance {
+        let (is_taken, left, chance) = match numbers.random() < chance {
             true => (true, taken, chance),
             false => (false, self.colours - taken, 1.0 - chance),
         };
@@ -235,10 +227,11 @@ impl Carried {
 impl<'s> PathTracer<'s> {
     /// Makes a scene ready.
     pub fn new(scene: &'s Scene<'s>, settings: PathSettings) -> Self {
-        let medium = |volume: &'s Volume<'s>| {
+        let lookup = settings.lookup;
+        let medium = |volume: &'s Volume<'s>, shape: Shape<'s>| {
             let extinction = Vec3::from_array(volume.extinction);
             let scale = extinction.max_element();
-            let region = Region::new(volume.shape).filter(|_| scale > 0.0)?;
+            let region = Region::new(shape, lookup).filter(|_| scale > 0.0)?;
             let is_grey = extinction == Vec3::splat(scale);
             let shares = if is_grey { Vec3::ONE } else { extinction / scale };
             let albedo = Vec3::from_array(volume.albedo);
@@ -246,39 +239,47 @@ impl<'s> PathTracer<'s> {
         };
         let glow = |volume: &'s Volume<'s>| {
             let emission = volume.emission.as_ref()?;
-            let region = Region::new(emission.channel.map_or(volume.shape, Shape::Grid))?;
+            let region = Region::new(emission.channel.map_or(volume.shape, Shape::Grid), lookup)?;
             Some(Glow { region, spectrum: &emission.spectrum })
         };
-        let media: Vec<_> = scene.volumes.iter().filter_map(medium).collect();
+        let media: Vec<_> = scene.volumes.iter().filter_map(|volume| medium(volume, volume.shape)).collect();
+        let far = scene.volumes.iter().any(|volume| volume.coarse.is_some()).then(|| {
+            let coarse =
+                |volume: &'s Volume<'s>| medium(volume, volume.coarse.map_or(volume.shape, Shape::Grid));
+            scene.volumes.iter().filter_map(coarse).collect::<Vec<_>>()
+        });
         let glows = scene.volumes.iter().filter_map(glow).collect();
-        let shades = scene.lights.iter().map(|light| shade(light, &media)).collect();
-        PathTracer { scene, settings, media, glows, shades }
+        let shades = scene.lights.iter().map(|light| shade(light, far.as_ref().unwrap_or(&media))).collect();
+        PathTracer { scene, settings, media, far, glows, shades }
     }
 
     /// What a thread needs.
     pub fn worker(&self) -> PathWorker<'s> {
+        let readers = |media: &[Medium<'s>]| media.iter().map(|medium| medium.region.reader()).collect();
         PathWorker {
-            media: self.media.iter().map(|medium| medium.region.reader()).collect(),
+            media: readers(&self.media),
+            far: self.far.as_deref().map_or(Vec::new(), readers),
             glows: self.glows.iter().map(|glow| glow.region.reader()).collect(),
         }
     }
 
-    /// What one path says of the light along a ray.
-    pub fn sample(&self, worker: &mut PathWorker<'s>, ray: &Ray, seed: u32) -> PathSample {
+    /// What one path says of the light along a ray, by numbers of its own. Whoever chose the ray by some of them took those of
+    /// the first set.
+    pub fn sample(&self, worker: &mut PathWorker<'s>, ray: &Ray, mut numbers: Sampler) -> PathSample {
         let Scene { lights, sky, .. } = self.scene;
         // A sky without sharp lights is best met by chance: a path that leaves the medium sees it with its whole weight.
         let sky_map = match sky {
             Sky::Map(map) if self.settings.sky_rays && !map.is_black() => Some(map.as_ref()),
             _ => None,
         };
-        let mut random = Random { path: seed, count: 0 };
         let mut carried = Carried { weight: Vec3::ONE, colours: Vec3::ONE };
         let mut sample = PathSample::default();
         let mut ray = *ray;
         let mut scatterings = 0;
         loop {
             let emitted = if scatterings == 0 { &mut sample.emission } else { &mut sample.indirect };
-            let collision = self.fly(worker, &ray, &mut carried, emitted, &mut random);
+            let is_far = scatterings > 0 && self.far.is_some();
+            let collision = self.fly(worker, is_far, &ray, &mut carried, emitted, &mut numbers);
             let Some(Collision { distance, medium }) = collision else {
                 match scatterings {
                     0 => sample.passed = true,
@@ -300,7 +301,7 @@ impl<'s> PathTracer<'s> {
             scatterings += 1;
             let chance = carried.worth().max_element() / ROULETTE_WEIGHT;
             if chance < 1.0 {
-                if random.unit() >= chance {
+                if numbers.random() >= chance {
                     break;
                 }
                 carried.weight /= chance;
@@ -310,18 +311,20 @@ impl<'s> PathTracer<'s> {
             let mut light = Vec3::ZERO;
             let from =
                 Scattering { at: origin, before, phase: medium.phase, worth: carried.worth().max_element() };
-            let (after, _) = medium.phase.sample(before, [random.unit(), random.unit()]);
+            // A set of even numbers for each scattering: where to, whether a shadow ray looks, how far to the next.
+            numbers.start_set(scatterings);
+            let (after, _) = medium.phase.sample(before, numbers.next_2d());
             let may_go_on = self.settings.max_scatterings.is_none_or(|most| scatterings < most);
             let mut later = Vec3::ZERO;
             for (source, shade) in lights.iter().zip(&self.shades) {
                 let shaded = shade.as_ref().map(|shade| shade.at(origin));
-                light += self.arriving(worker, source, shaded, &from, &mut random);
+                light += self.arriving(worker, source, shaded, &from, &mut numbers);
                 if let (true, Light::Sun(sun), Some(shaded)) = (may_go_on, source, shaded) {
                     later += Vec3::from_array(sun.irradiance) * expected_later(sun, shaded, &from, after);
                 }
             }
             if let Some(map) = sky_map {
-                light += self.mapped(worker, map, origin, before, medium.phase, &mut random);
+                light += self.mapped(worker, map, origin, before, medium.phase, &mut numbers);
             }
             let light = carried.worth() * light;
             *(if scatterings == 1 { &mut sample.direct } else { &mut sample.indirect }) += light;
@@ -338,7 +341,7 @@ impl<'s> PathTracer<'s> {
         light: &Light,
         shade: Option<Shaded>,
         from: &Scattering,
-        random: &mut Random,
+        numbers: &mut Sampler,
     ) -> Vec3 {
         let Scattering { at, before, phase, .. } = *from;
         match light.arriving(at) {
@@ -348,15 +351,15 @@ impl<'s> PathTracer<'s> {
                 let towards = Ray { origin: at, direction };
                 irradiance
                     * (scatters
-                        * self.passes(worker, &towards, distance, shade, scatters * from.worth, random))
+                        * self.passes(worker, &towards, distance, shade, scatters * from.worth, numbers))
             }
             Arriving::Cone { cone, radiance } => {
                 let solid_angle = cone.solid_angle();
                 // Where the phase function has a peak narrower than the light, that is looked for as well.
                 let peak = phase.value(1.0).max(phase.value(-1.0));
                 let is_narrower = peak * solid_angle > 1.0;
-                let takes_phase = is_narrower && random.unit() < 0.5;
-                let u = [random.unit(), random.unit()];
+                let takes_phase = is_narrower && numbers.random() < 0.5;
+                let u = numbers.random_2d();
                 let direction = if takes_phase { phase.sample(before, u).0 } else { cone.sample(u) };
                 if takes_phase && !cone.contains(direction) {
                     return Vec3::ZERO;
@@ -369,7 +372,7 @@ impl<'s> PathTracer<'s> {
                 let distance = light.distance(at, direction);
                 radiance
                     * (scatters / density
-                        * self.passes(worker, &towards, distance, shade, scatters * from.worth, random))
+                        * self.passes(worker, &towards, distance, shade, scatters * from.worth, numbers))
             }
         }
     }
@@ -383,10 +386,10 @@ impl<'s> PathTracer<'s> {
         origin: DVec3,
         before: Vec3,
         phase: Phase,
-        random: &mut Random,
+        numbers: &mut Sampler,
     ) -> Vec3 {
-        let takes_map = random.unit() < 0.5;
-        let u = [random.unit(), random.unit()];
+        let takes_map = numbers.random() < 0.5;
+        let u = numbers.random_2d();
         let direction = match takes_map {
             true => map.sample(u).map(|sample| sample.direction),
             false => Some(phase.sample(before, u).0),
@@ -395,7 +398,7 @@ impl<'s> PathTracer<'s> {
         let scatters = phase.between(before, direction);
         let density = 0.5 * (scatters + map.pdf(direction));
         let towards = Ray { origin, direction: direction.as_dvec3().normalize() };
-        let passes = self.transmittance(worker, &towards, f64::INFINITY, random);
+        let passes = self.transmittance(worker, &towards, f64::INFINITY, numbers);
         if density > 0.0 { map.radiance(direction) * (scatters / density) * passes } else { Vec3::ZERO }
     }
 
@@ -404,60 +407,75 @@ impl<'s> PathTracer<'s> {
     fn fly<'t>(
         &'t self,
         worker: &mut PathWorker<'s>,
+        is_far: bool,
         ray: &Ray,
         carried: &mut Carried,
         emitted: &mut Vec3,
-        random: &mut Random,
+        numbers: &mut Sampler,
     ) -> Option<Collision<'t, 's>> {
-        let PathWorker { media, glows } = worker;
-        let (collision, told) = match (self.media.as_slice(), media.as_mut_slice()) {
-            ([medium @ Medium { region: Region::Field(field), is_grey: true, .. }], [Some(reader)]) => {
-                let distance = first_collision(field, reader, ray, medium.scale, || random.unit());
+        let PathWorker { media: readers, far: far_readers, glows } = worker;
+        let (media, readers) = match &self.far {
+            Some(far) if is_far => (far, far_readers),
+            _ => (&self.media, readers),
+        };
+        let (collision, told) = match (media.as_slice(), readers.as_mut_slice()) {
+            ([medium @ Medium { region: Region::Field(field), is_grey: true, .. }], [Some(reader)])
+                if self.settings.lookup == Lookup::Trilinear =>
+            {
+                let mut first = Some(numbers.next_1d());
+                let number = || first.take().unwrap_or_else(|| numbers.random());
+                let distance = first_collision(field, reader, ray, medium.scale, number);
                 (distance.map(|distance| Collision { distance, medium }), 0.0)
             }
-            _ => self.fly_among(media, glows, ray, carried, emitted, random),
+            _ => self.fly_among(media, readers, glows, ray, carried, emitted, numbers),
         };
         let end = collision.as_ref().map_or(f64::INFINITY, |collision| collision.distance);
         if !self.glows.is_empty() {
-            *emitted += carried.worth() * self.emitted(glows, ray, [told, end], random);
+            *emitted += carried.worth() * self.emitted(glows, ray, [told, end], numbers);
         }
         collision
     }
 
     /// As [`fly`](Self::fly), among any media; gives also how far emission has been counted.
+    #[expect(
+        clippy::too_many_arguments,
+        reason = "they are the parts of a worker and of a path that change on the way"
+    )]
     fn fly_among<'t>(
-        &'t self,
+        &self,
+        media: &'t [Medium<'s>],
         readers: &mut [Option<Reader<'s>>],
         glows: &mut [Option<Reader<'s>>],
         ray: &Ray,
         carried: &mut Carried,
         emitted: &mut Vec3,
-        random: &mut Random,
+        numbers: &mut Sampler,
     ) -> (Option<Collision<'t, 's>>, f64) {
         let mut told = 0.0;
-        let media = self.media.iter().zip(readers);
+        let lookup = self.settings.lookup;
+        let media = media.iter().zip(readers);
         let mut fronts: Vec<Front<'_, 't, 's>> = media
-            .filter_map(|(medium, reader)| Front::new(medium, reader.as_mut(), ray, carried.colours, random))
+            .filter_map(|(medium, reader)| Front::new(medium, reader.as_mut(), ray, carried.colours, numbers))
             .collect();
         loop {
             let nearest = fronts.iter_mut().min_by(|a, b| a.next.total_cmp(&b.next));
             let Some(front) = nearest.filter(|front| front.next < f64::INFINITY) else { return (None, told) };
             let distance = front.next;
-            let part = front.density_over_majorant();
+            let part = front.density_over_majorant(lookup, numbers);
             let is_real = if front.medium.is_grey {
-                part >= 1.0 || random.unit() < part
+                part >= 1.0 || numbers.random() < part
             } else {
                 // What is emitted up to here is worth what the path was worth up to here.
                 if !self.glows.is_empty() {
-                    *emitted += carried.worth() * self.emitted(glows, ray, [told, distance], random);
+                    *emitted += carried.worth() * self.emitted(glows, ray, [told, distance], numbers);
                     told = distance;
                 }
-                carried.turns((front.medium.shares * (part / front.live)).min(Vec3::ONE), random)
+                carried.turns((front.medium.shares * (part / front.live)).min(Vec3::ONE), numbers)
             };
             if is_real {
                 return (Some(Collision { distance, medium: front.medium }), told);
             }
-            front.advance(carried.colours, random);
+            front.advance(carried.colours, numbers);
         }
     }
 
@@ -470,28 +488,27 @@ impl<'s> PathTracer<'s> {
         limit: f64,
         shade: Option<Shaded>,
         worth: f32,
-        random: &mut Random,
+        numbers: &mut Sampler,
     ) -> Vec3 {
-        let Some(Shaded { passes, varies }) = shade else {
-            return self.transmittance(worker, ray, limit, random);
+        // A shadow ray that is uncertain itself would not do: it counts for many.
+        let (Some(Shaded { passes, varies }), Some(filter)) = (shade, self.settings.lookup.along_lines())
+        else {
+            return self.transmittance(worker, ray, limit, numbers);
         };
         let chance = worth * (SHADE_EDGES * varies + SHADE_HALVES * passes * (1.0 - passes));
         let chance = chance.clamp(LEAST_SHADOW_RAYS, 1.0);
         let mut light = passes;
         // What a shadow ray finds beside it has to count for all those that are not followed.
-        if random.unit() < chance {
-            light += (self.exact_transmittance(worker, ray) - passes) / chance;
+        if numbers.next_1d() < chance {
+            light += (self.exact_transmittance(worker, ray, filter) - passes) / chance;
         }
         Vec3::splat(light)
     }
 
-    /// The share of light that passes along a ray to its end, where all media are grey.
-    fn exact_transmittance(&self, worker: &mut PathWorker<'s>, ray: &Ray) -> f32 {
-        let media = self.media.iter().zip(&mut worker.media);
-        let depth = media.map(|(medium, reader)| match (&medium.region, reader) {
-            (Region::Field(field), Some(reader)) => {
-                medium.scale * optical_depth(field, reader, ray, Filter::Trilinear)
-            }
+    /// The share of light that passes along a ray to its end, where all media are grey and integrals have a closed form.
+    fn exact_transmittance(&self, worker: &mut PathWorker<'s>, ray: &Ray, filter: Filter) -> f32 {
+        let depth = self.far(worker).map(|(medium, reader)| match (&medium.region, reader) {
+            (Region::Field(field), Some(reader)) => medium.scale * optical_depth(field, reader, ray, filter),
             (Region::Solid(solid), _) => {
                 let length = solid.interval(ray).map_or(0.0, |[start, end]| end - start);
                 medium.scale * length as f32
@@ -501,18 +518,36 @@ impl<'s> PathTracer<'s> {
         exp(-depth.sum::<f32>())
     }
 
+    /// The media that rays of scattered light meet, with their readers.
+    fn far<'t, 'w>(
+        &'t self,
+        worker: &'w mut PathWorker<'s>,
+    ) -> impl Iterator<Item = (&'t Medium<'s>, &'w mut Option<Reader<'s>>)> {
+        match &self.far {
+            Some(far) => far.iter().zip(&mut worker.far),
+            None => self.media.iter().zip(&mut worker.media),
+        }
+    }
+
     /// A vector whose mean is the share of light that passes along a ray up to a distance.
-    fn transmittance(&self, worker: &mut PathWorker<'s>, ray: &Ray, limit: f64, random: &mut Random) -> Vec3 {
+    fn transmittance(
+        &self,
+        worker: &mut PathWorker<'s>,
+        ray: &Ray,
+        limit: f64,
+        numbers: &mut Sampler,
+    ) -> Vec3 {
         let mut passes = Vec3::ONE;
-        for (medium, reader) in self.media.iter().zip(&mut worker.media) {
+        let lookup = self.settings.lookup;
+        for (medium, reader) in self.far(worker) {
             passes *= match (&medium.region, reader) {
                 (Region::Field(field), Some(reader)) if medium.is_grey => {
-                    let [passes] = pass(field, reader, medium.scale, [1.0], ray, limit, random);
+                    let [passes] = pass(field, reader, lookup, medium.scale, [1.0], ray, limit, numbers);
                     Vec3::splat(passes)
                 }
                 (Region::Field(field), Some(reader)) => {
                     let shares = medium.shares.to_array();
-                    Vec3::from_array(pass(field, reader, medium.scale, shares, ray, limit, random))
+                    Vec3::from_array(pass(field, reader, lookup, medium.scale, shares, ray, limit, numbers))
                 }
                 (Region::Solid(solid), _) => match solid.interval(ray) {
                     Some([start, end]) => {
@@ -537,8 +572,10 @@ impl<'s> PathTracer<'s> {
         readers: &mut [Option<Reader<'s>>],
         ray: &Ray,
         [from, to]: [f64; 2],
-        random: &mut Random,
+        numbers: &mut Sampler,
     ) -> Vec3 {
+        // What glows is not linear in what is looked up, so that a voxel at random would not do.
+        let lookup = self.settings.lookup.mean();
         let mut light = Vec3::ZERO;
         for (glow, reader) in self.glows.iter().zip(readers) {
             let cut = |[start, end]: [f64; 2]| [start.max(from), end.min(to)];
@@ -554,8 +591,9 @@ impl<'s> PathTracer<'s> {
                     let mut segments = field.runs(walker, local, 0.0, length);
                     while let Some(segment) = segments.next_segment() {
                         let length = segment.t1 - segment.t0;
-                        let t = segment.t0 + random.unit() * length;
-                        light += glow.spectrum.radiance(field.sample(blocks, local.at(t))) * length;
+                        let t = segment.t0 + numbers.random() * length;
+                        let value = field.look_up(blocks, local.at(t), lookup, || [0.0; 3]);
+                        light += glow.spectrum.radiance(value) * length;
                     }
                 }
                 (Region::Solid(solid), _) => {
@@ -572,14 +610,19 @@ impl<'s> PathTracer<'s> {
 /// A number whose mean is the share of light that passes along a ray through a field up to a distance, for each of some
 /// colours, whose extinctions are `shares` of `scale`. By residual ratio tracking: what the least extinction of a segment
 /// takes away is known, only the rest is left to chance.
+#[expect(
+    clippy::too_many_arguments,
+    reason = "a medium in its parts, as colours are only known to the caller"
+)]
 fn pass<'s, const COLOURS: usize>(
     field: &Field<'s>,
     reader: &mut Reader<'s>,
+    lookup: Lookup,
     scale: f32,
     shares: [f32; COLOURS],
     ray: &Ray,
     limit: f64,
-    random: &mut Random,
+    numbers: &mut Sampler,
 ) -> [f32; COLOURS] {
     let Some([start, end]) = field.interval(ray) else { return [1.0; COLOURS] };
     let Reader { shadow_walker, blocks, .. } = reader;
@@ -587,7 +630,7 @@ fn pass<'s, const COLOURS: usize>(
     let local = field.local(ray, start);
     let mut segments = field.runs(walker, local, 0.0, (end.min(limit) - start) as f32);
     // What passes is `ratio × e^-known`; the exponential is taken where it is wanted.
-    let (mut ratio, mut known, mut depth) = ([1.0_f32; COLOURS], 0.0_f32, random.depth());
+    let (mut ratio, mut known, mut depth) = ([1.0_f32; COLOURS], 0.0_f32, depth_of(numbers.random()));
     let passes = |ratio: &[f32; COLOURS], known: f32| -> [f32; COLOURS] {
         std::array::from_fn(|i| ratio[i] * exp(-known.min(f32::MAX) * shares[i]))
     };
@@ -605,16 +648,17 @@ fn pass<'s, const COLOURS: usize>(
                 break;
             }
             t += depth / (residual * scale);
-            let part = (field.sample(blocks, local.at(t)) - segment.min) / residual;
+            let value = field.look_up(blocks, local.at(t), lookup, || numbers.random_3d());
+            let part = (value - segment.min) / residual;
             for (ratio, share) in ratio.iter_mut().zip(shares) {
                 *ratio *= (1.0 - part * share).max(0.0);
             }
-            depth = random.depth();
+            depth = depth_of(numbers.random());
         }
         let now = passes(&ratio, known);
         let most = now.iter().copied().fold(0.0, f32::max);
         if most < ROULETTE_TRANSMITTANCE {
-            if random.unit() * ROULETTE_TRANSMITTANCE >= most {
+            if numbers.random() * ROULETTE_TRANSMITTANCE >= most {
                 return [0.0; COLOURS];
             }
             // Exactly that for the strongest: a last bit less would ask for the next turn at once.
@@ -698,7 +742,7 @@ impl<'r, 't, 's> Front<'r, 't, 's> {
         reader: Option<&'r mut Reader<'s>>,
         ray: &Ray,
         colours: Vec3,
-        random: &mut Random,
+        numbers: &mut Sampler,
     ) -> Option<Self> {
         let (next, place) = match (&medium.region, reader) {
             (Region::Field(field), Some(reader)) => {
@@ -716,12 +760,12 @@ impl<'r, 't, 's> Front<'r, 't, 's> {
             (Region::Field(_), None) => return None,
         };
         let mut front = Front { medium, next, live: 1.0, place };
-        front.advance(colours, random);
+        front.advance(colours, numbers);
         Some(front)
     }
 
     /// Moves on to the next tentative collision. A colour that the path has no share of needs no majorant.
-    fn advance(&mut self, colours: Vec3, random: &mut Random) {
+    fn advance(&mut self, colours: Vec3, numbers: &mut Sampler) {
         if !self.medium.is_grey {
             self.live = Vec3::select(colours.cmpgt(Vec3::ZERO), self.medium.shares, Vec3::ZERO).max_element();
         }
@@ -730,7 +774,7 @@ impl<'r, 't, 's> Front<'r, 't, 's> {
             self.next = f64::INFINITY;
             return;
         }
-        let mut depth = random.depth();
+        let mut depth = depth_of(numbers.random());
         self.next = match &mut self.place {
             Place::Solid { end } => {
                 let next = self.next + f64::from(depth / scale);
@@ -753,7 +797,7 @@ impl<'r, 't, 's> Front<'r, 't, 's> {
     }
 
     /// The density at the tentative collision as a share of the majorant.
-    fn density_over_majorant(&mut self) -> f32 {
+    fn density_over_majorant(&mut self, lookup: Lookup, numbers: &mut Sampler) -> f32 {
         match &mut self.place {
             Place::Solid { .. } => 1.0,
             Place::Field { segment, .. }
@@ -762,7 +806,8 @@ impl<'r, 't, 's> Front<'r, 't, 's> {
                 1.0
             }
             Place::Field { field, blocks, local, segment, t, .. } => {
-                (field.sample(blocks, local.at(*t)) / segment.max).min(1.0)
+                let value = field.look_up(blocks, local.at(*t), lookup, || numbers.random_3d());
+                (value / segment.max).min(1.0)
             }
         }
     }
@@ -780,12 +825,12 @@ mod tests {
         for g in [-0.7, 0.2, 0.8] {
             let phase = Phase::HenyeyGreenstein { g };
             let from = Scattering { at: DVec3::ZERO, before, phase, worth: 1.0 };
-            let mut random = Random { path: 7, count: 0 };
-            let expected = |random: &mut Random| {
-                let (after, _) = phase.sample(before, [random.unit(), random.unit()]);
+            let mut numbers = Sampler::new(0, 0, 7, 0);
+            let expected = |numbers: &mut Sampler| {
+                let (after, _) = phase.sample(before, numbers.random_2d());
                 f64::from(expected_later(&sun, shaded, &from, after))
             };
-            let all: Vec<f64> = (0..200_000).map(|_| expected(&mut random)).collect();
+            let all: Vec<f64> = (0..200_000).map(|_| expected(&mut numbers)).collect();
             let mean = all.iter().sum::<f64>() / all.len() as f64;
             let variance = all.iter().map(|value| (value - mean).powi(2)).sum::<f64>() / all.len() as f64;
             let error = (variance / all.len() as f64).sqrt();

@@ -5,6 +5,10 @@
 //! paths in their order. So a film is the same, bit for bit, for any number of threads, passes of any size,
 //! and a render that was stopped and went on.
 //!
+//! The paths of a pixel are spread evenly ([`sampler`](crate::sampler)), so that their mean is less noisy than that of independent
+//! ones. Standard errors and noise are those of independent paths: never too small in the mean, and by up to two fifths too large where a
+//! pixel holds an edge.
+//!
 //! All pixels get the same number of paths. To give more to those that look noisy would bias the picture: a
 //! pixel whose first paths all miss a rare bright event looks quiet, gets no more of them and stays too dark.
 //! Where the whole picture stops by its noise, the same holds to a degree that drowns in it.
@@ -17,9 +21,9 @@ use std::time::{Duration, Instant};
 use glam::DVec2;
 
 use crate::film::Film;
-use crate::hash::{hash_pixel, hash_u32, unit_f32};
 use crate::path::{PathSettings, PathTracer, PathWorker};
 use crate::picture::each_tile;
+use crate::sampler::Sampler;
 use crate::scene::Scene;
 
 /// The noise of fewer paths per pixel is not believed.
@@ -97,10 +101,11 @@ pub fn trace<'s>(scene: &'s Scene<'s>, plan: &Plan, film: &mut Film, watch: &mut
     let (cancel, tile_done) = (watch.cancel, watch.tile);
     let cancelled = || cancel.is_some_and(|cancel| cancel.load(Ordering::Relaxed));
     let path = |worker: &mut PathWorker<'s>, x: u32, y: u32, number: u32| {
-        let random = |dimension| hash_pixel(x, y, number, hash_u32(plan.seed).wrapping_add(dimension));
-        let offset = DVec2::new(unit_f32(random(0)).into(), unit_f32(random(1)).into());
-        let ray = scene.camera.ray(DVec2::new(x.into(), y.into()) + offset, tiling.width, tiling.height);
-        tracer.sample(worker, &ray, random(2))
+        let mut numbers = Sampler::new(x, y, number, plan.seed);
+        let [u, v] = numbers.next_2d().map(f64::from);
+        let at = DVec2::new(f64::from(x) + u, f64::from(y) + v);
+        let ray = scene.camera.ray(at, tiling.width, tiling.height);
+        tracer.sample(worker, &ray, numbers)
     };
     let pass_samples = plan.pass_samples.max(1);
     let pixels = f64::from(tiling.width) * f64::from(tiling.height);

@@ -12,8 +12,8 @@ use crate::hash::{hash_pixel, hash_u32, unit_f32};
 pub const SET_SIZE: u32 = 4;
 
 /// From this set on numbers are random: what a path does that late depends on too much for evenness to
-/// survive.
-pub const EVEN_SETS: u32 = 16;
+/// survive, and making sets takes time.
+pub const EVEN_SETS: u32 = 3;
 
 /// The golden ratio's bits; multiples of it are far from each other.
 const GOLDEN: u32 = 0x9e37_79b9;
@@ -144,20 +144,13 @@ impl Sampler {
         }
     }
 
-    /// The next number, from 0 to less than 1: even in the first [`EVEN_SETS`] sets, random beyond. Goes on
-    /// with the next set after the last of one.
+    /// The next number, from 0 to less than 1: even in the first [`EVEN_SETS`] sets, random beyond, and after the last of a
+    /// set.
     #[inline]
     pub fn next_1d(&mut self) -> f32 {
-        if self.used == SET_SIZE {
-            self.start_set(self.set.saturating_add(1));
-        }
-        let value = if self.set < EVEN_SETS {
-            self.values.get(self.used as usize).copied().unwrap_or(0.0)
-        } else {
-            self.random()
-        };
-        self.used += 1;
-        value
+        let even = if self.set < EVEN_SETS { self.values.get(self.used as usize).copied() } else { None };
+        self.used = (self.used + 1).min(SET_SIZE);
+        even.unwrap_or_else(|| self.random())
     }
 
     /// The next two numbers that are even together: those of the next whole pair of a set.
@@ -179,6 +172,12 @@ impl Sampler {
     #[inline]
     pub fn random_2d(&mut self) -> [f32; 2] {
         [self.random(), self.random()]
+    }
+
+    /// Three random numbers.
+    #[inline]
+    pub fn random_3d(&mut self) -> [f32; 3] {
+        [self.random(), self.random(), self.random()]
     }
 }
 

@@ -12,6 +12,7 @@ use std::sync::OnceLock;
 
 use glam::{DMat3, DVec3, IVec3, Mat3, Vec3};
 use nuage_volume::accessor::{Accessor, BrickPlace};
+use nuage_volume::brick::Bounds;
 use nuage_volume::channel::Channel;
 use nuage_volume::space::LOG2_NODE5_BRICKS;
 use nuage_volume::tree::{Content, Tree};
@@ -38,6 +39,8 @@ pub struct Field<'a> {
     brick_box: [IVec3; 2],
     /// Where samples can be other than zero, as positions.
     bounds: [DVec3; 2],
+    /// Whether samples reach one voxel beyond their cell on all sides.
+    is_wide: bool,
 }
 
 /// What one thread needs to read a [`Field`]: places that it remembers.
@@ -105,12 +108,23 @@ pub struct Segment {
 impl<'a> Field<'a> {
     /// Makes a channel ready. `None` if it has no active voxel or is zero everywhere.
     pub fn new(channel: &'a Channel) -> Option<Self> {
+        Self::reaching(channel, 0)
+    }
+
+    /// The same for samples that reach one voxel beyond their cell on all sides, as cubic ones do. To be walked by
+    /// [`runs`](Self::runs), whose bounds are as wide.
+    pub(crate) fn wide(channel: &'a Channel) -> Option<Self> {
+        Self::reaching(channel, 1)
+    }
+
+    fn reaching(channel: &'a Channel, voxels: i32) -> Option<Self> {
         let active = channel.active_box?;
         if channel.tree.root.is_empty() {
             return None;
         }
         // Interpolation reaches one voxel beyond the box on both sides.
-        let (min, max) = (active.min.saturating_sub(IVec3::ONE), active.max);
+        let min = active.min.saturating_sub(IVec3::splat(1 + voxels));
+        let max = active.max.saturating_add(IVec3::splat(voxels));
         // One brick before the first, so that positions are not negative.
         let base_brick: IVec3 = (min >> 3) - 1;
         // In doubles: at the low end of index space this lies outside of 32 bits.
@@ -125,6 +139,7 @@ impl<'a> Field<'a> {
             base_brick,
             brick_box: [min >> 3, max >> 3],
             bounds: [min.as_dvec3() - base, max.as_dvec3() + 1.0 - base],
+            is_wide: voxels > 0,
         })
     }
 
@@ -166,8 +181,9 @@ impl<'a> Field<'a> {
 
     /// The first voxel of the active box, and its size.
     pub(crate) fn voxel_box(&self) -> [DVec3; 2] {
-        let size = self.bounds[1] - self.bounds[0] - 1.0;
-        [self.bounds[0] + 1.0 + self.base_brick.as_dvec3() * 8.0, size]
+        let reach = f64::from(u8::from(self.is_wide));
+        let size = self.bounds[1] - self.bounds[0] - 1.0 - 2.0 * reach;
+        [self.bounds[0] + 1.0 + reach + self.base_brick.as_dvec3() * 8.0, size]
     }
 
     /// The corners, in the world, of the box of all voxels other than zero.
@@ -286,6 +302,7 @@ impl<'a> Field<'a> {
             sign: IVec3::select(forward, IVec3::ONE, IVec3::NEG_ONE),
             brick_end: IVec3::select(forward, self.brick_box[1] + 1, self.brick_box[0] - 1),
             root_leaps_left: 4096,
+            is_wide: self.is_wide,
             waiting: [Run { t0, t1, kind: RunKind::Varying }; 3],
             waiting_count: 0,
         };
@@ -368,6 +385,8 @@ pub struct Runs<'r, 'a> {
     brick_end: IVec3,
     /// Rounding must not let a ray leap between two cells for ever.
     root_leaps_left: u32,
+    /// Whether bounds are those of samples that reach one voxel beyond their cell.
+    is_wide: bool,
     /// Runs found and not yet given out, the last one first.
     waiting: [Run; 3],
     waiting_count: usize,
@@ -379,13 +398,8 @@ impl Runs<'_, '_> {
     #[inline]
     pub fn next_segment(&mut self) -> Option<Segment> {
         while self.t < self.t_end {
-            let (log2_bricks, footprint) = self.accessor.footprint(self.brick);
             let t0 = self.t;
-            if log2_bricks == 0 {
-                self.step_brick();
-            } else {
-                self.leap(log2_bricks);
-            }
+            let (log2_bricks, footprint) = self.pass();
             let t1 = self.t.min(self.t_end);
             if footprint.max > 0.0 && t0 < t1 {
                 return Some(Segment { t0, t1, min: footprint.min, max: footprint.max });
@@ -424,6 +438,42 @@ impl Runs<'_, '_> {
             }
         }
         None
+    }
+
+    /// Moves on behind the region of the brick, and gives its size and the bounds of samples in it.
+    #[inline]
+    fn pass(&mut self) -> (u32, Bounds) {
+        if self.is_wide {
+            return (0, self.pass_wide());
+        }
+        let (log2_bricks, footprint) = self.accessor.footprint(self.brick);
+        if log2_bricks == 0 {
+            self.step_brick();
+        } else {
+            self.leap(log2_bricks);
+        }
+        (log2_bricks, footprint)
+    }
+
+    /// The same for samples that reach one voxel further: bounds are those of the bricks around as well, and of a larger region
+    /// only the bricks inside, all around which it is the same, are passed at once.
+    fn pass_wide(&mut self) -> Bounds {
+        let (log2_bricks, footprint) = self.accessor.footprint(self.brick);
+        if log2_bricks > 0 && footprint.is_constant() {
+            let (origin, last) = extent(self.brick, log2_bricks);
+            let (origin, last) = (origin + 1, last - 1);
+            if self.brick.cmpge(origin).all() && self.brick.cmple(last).all() {
+                self.leap_over(origin, last);
+                return footprint;
+            }
+        }
+        let mut bounds = footprint;
+        for i in 0..27 {
+            let step = IVec3::new(i / 9, i / 3 % 3, i % 3) - 1;
+            bounds = bounds.union(self.accessor.footprint(self.brick.wrapping_add(step)).1);
+        }
+        self.step_brick();
+        bounds
     }
 
     /// What the voxels of a brick are.
@@ -598,13 +648,8 @@ impl Iterator for Runs<'_, '_> {
         }
         let mut varying: Option<Run> = None;
         while self.t < self.t_end {
-            let (log2_bricks, footprint) = self.accessor.footprint(self.brick);
             let (t0, brick) = (self.t, self.brick);
-            if log2_bricks == 0 {
-                self.step_brick();
-            } else {
-                self.leap(log2_bricks);
-            }
+            let (log2_bricks, footprint) = self.pass();
             let t1 = self.t.min(self.t_end);
             if t0 >= t1 {
                 continue;

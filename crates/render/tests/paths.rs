@@ -72,7 +72,7 @@ fn pictures_are_those_of_another_renderer() {
         [("het64_g0", 0.0, None, false), ("het64_g08", 0.8, None, true), ("het64_g0_ss", 0.0, Some(1), false)]
     {
         let scene = lit_scene(&json, &density, g);
-        let settings = PathSettings { max_scatterings, sky_rays };
+        let settings = PathSettings { max_scatterings, sky_rays, ..PathSettings::default() };
         compare(name, &scene, &traced(&scene, settings, 48, 1));
     }
 }

@@ -33,6 +33,7 @@ fn scene<'a>(density: &'a Channel, emission: Option<&'a Channel>) -> Scene<'a> {
     let spectrum = Spectrum::Linear { rgb: [0.1, 0.05, 0.02] };
     let volume = Volume {
         shape: Shape::Grid(density),
+        coarse: None,
         extinction: [0.3; 3],
         albedo: [0.9, 0.8, 0.7],
         phase: Phase::HenyeyGreenstein { g: 0.3 },

@@ -28,6 +28,7 @@ fn scene(density: &Channel) -> Scene<'_> {
     let emission = Emission { channel: None, spectrum: Spectrum::Linear { rgb: [0.1, 0.05, 0.02] } };
     let volume = Volume {
         shape: Shape::Grid(density),
+        coarse: None,
         extinction: [0.3; 3],
         albedo: [0.9, 0.8, 0.7],
         phase: Phase::HenyeyGreenstein { g: 0.3 },
@@ -95,9 +96,10 @@ fn a_film_that_was_stopped_and_went_on_is_the_same() {
     assert!(film == render(&Plan { samples: 12, ..plan }, size));
 }
 
-/// Means of many renders differ from each other as much as each says it may be off.
+/// Means of many renders differ from each other less than each says it may be off, which is what independent paths would be off:
+/// paths that are spread evenly do better.
 #[test]
-fn standard_errors_are_what_they_say() {
+fn standard_errors_are_not_too_small_and_even_paths_are_quieter() {
     const SEEDS: u32 = 200;
     let size = [8, 6];
     let films: Vec<Film> = (0..SEEDS)
@@ -116,7 +118,7 @@ fn standard_errors_are_what_they_say() {
         }
         // 48 variances, each of 200 means: known to about 1.5 %, somewhat less for light with rare bright
         // paths.
-        assert!(found > 0.0 && (found / said - 1.0).abs() < 0.08, "channel {c}: {found} {said}");
+        assert!((0.4..0.9).contains(&(found / said)), "channel {c}: {found} {said}");
     }
 }
 

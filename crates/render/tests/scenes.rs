@@ -10,6 +10,7 @@ use nuage_render::camera::{Camera, Ray};
 use nuage_render::light::{Light, Sky, Spot, Sun};
 use nuage_render::march::unsupported;
 use nuage_render::path::{PathSettings, PathTracer};
+use nuage_render::sampler::Sampler;
 use nuage_render::scene::{Emission, Phase, Scene, Shape, Spectrum, Volume};
 use nuage_volume::channel::Channel;
 
@@ -25,7 +26,7 @@ fn means(scene: &Scene<'_>, settings: PathSettings, paths: u32) -> [(Vec3, Vec3)
         let pixel = i / paths;
         let at = DVec2::new(f64::from(pixel % SIDE) + 0.5, f64::from(pixel / SIDE) + 0.5);
         let ray = scene.camera.ray(at, SIDE, SIDE);
-        let sample = tracer.sample(&mut worker, &ray, i.wrapping_mul(0x9e37_79b9));
+        let sample = tracer.sample(&mut worker, &ray, Sampler::new(pixel, 0, i % paths, 0));
         for (sum, value) in sums.iter_mut().zip([sample.light(), Vec3::splat(f32::from(sample.passed))]) {
             let value = value.as_dvec3();
             sum[0] += value;
@@ -75,7 +76,7 @@ fn cube(min: DVec3, max: DVec3) -> Shape<'static> {
 
 fn medium(shape: Shape<'_>, extinction: [f32; 3], g: f32) -> Volume<'_> {
     let phase = Phase::HenyeyGreenstein { g };
-    Volume { shape, extinction, albedo: [0.9, 0.6, 0.3], phase, emission: None }
+    Volume { shape, coarse: None, extinction, albedo: [0.9, 0.6, 0.3], phase, emission: None }
 }
 
 fn sun() -> Light {
@@ -157,7 +158,8 @@ fn a_slab_follows_the_closed_form() {
     let mut worker = tracer.worker();
     let ray = Ray { origin: DVec3::new(0.0, 0.0, 5.0), direction: DVec3::NEG_Z };
     let count = 100_000;
-    let samples = (0..count).map(|seed| tracer.sample(&mut worker, &ray, seed).emission);
+    let samples =
+        (0..count).map(|seed| tracer.sample(&mut worker, &ray, Sampler::new(0, 0, seed, 0)).emission);
     let mean = samples.sum::<Vec3>() / count as f32;
     for (found, sigma) in mean.to_array().into_iter().zip(extinction) {
         let expected = (1.0 - f32::exp(-2.0 * sigma)) / sigma;
@@ -218,7 +220,7 @@ fn suns_as_large_as_the_sky_make_a_furnace() {
         let mut scene = scene(vec![volume], vec![half(Vec3::Y), half(Vec3::NEG_Y)]);
         scene.sky = Sky::Constant([0.0; 3]);
         scene.camera = Camera::look_at(DVec3::ZERO, DVec3::Z, DVec3::Y, 40.0).expect("a view");
-        let [(light, error), (passes, _)] = means(&scene, PathSettings::default(), 200);
+        let [(light, error), (passes, _)] = means(&scene, PathSettings::default(), 500);
         println!("g {g}: {light} ± {error}, {passes} passes");
         // The light of a colour that does not scatter is not there: what passes depends on the colour.
         let expected = Vec3::ONE - Vec3::new(-2.0, -4.0, -1.0).map(f32::exp);

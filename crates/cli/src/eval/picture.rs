@@ -72,9 +72,14 @@ impl Studio {
             true => {
                 let nothing = Tree::empty(0.0_f32, nuage_vdb::Shape::STANDARD);
                 let smoke = Grid { tree: Arc::new(nothing.into()), ..source.clone() };
-                Volume { density: self::channel(smoke)?, emission: Some(channel), surface: None }
+                Volume {
+                    density: self::channel(smoke)?,
+                    coarse: None,
+                    emission: Some(channel),
+                    surface: None,
+                }
             }
-            false => Volume { density: channel, emission: None, surface: None },
+            false => Volume { density: channel, coarse: None, emission: None, surface: None },
         };
         let volumes = [volume];
         let shot = Shot::new(look, world_box, &volumes)?;

@@ -17,7 +17,9 @@ use nuage_render::light::{Light, Spot};
 use toml::de::DeTable;
 
 use crate::error::Failure;
-use crate::look::{Integrator, Look, MOST_SAMPLES, View, not_negative, seconds, share, up};
+use crate::look::{
+    Filter, Integrator, Look, MOST_LEVELS, MOST_SAMPLES, View, not_negative, seconds, share, up,
+};
 use crate::plan::{
     EmissionPlan, Extinction, Given, Glow, LightPlan, PhasePlan, Plan, SkyPlan, VolumePlan, What,
 };
@@ -117,8 +119,15 @@ fn parse(text: &str, folder: &Path, look: &Look, given: &Given) -> Result<(Plan,
         put(given, "seed", &mut look.seed, integrator.parsed("seed", count(0, u32::MAX))?);
         let scatterings = integrator.parsed("scatterings", count(0, 1_000_000))?;
         put(given, "scatterings", &mut look.scatterings, scatterings.map(Some));
+        let filter = integrator.parsed("filter", |text| {
+            <Filter as clap::ValueEnum>::from_str(text, false).map_err(|_| {
+                "'nearest', 'trilinear', 'tricubic', 'stochastic-trilinear' or 'stochastic-tricubic' is needed".into()
+            })
+        })?;
+        put(given, "filter", &mut look.filter, filter);
+        put(given, "lod", &mut look.lod, integrator.parsed("lod", count(0, MOST_LEVELS as u32))?);
         put(given, "step", &mut look.step, integrator.parsed("step", values::positive)?);
-        put(given, "shadow_step", &mut look.shadow_step, integrator.parsed("shadow_step", values::positive)?);
+        put(given, "shadow_step", &mut look.shadow_step, integrator.parsed("shadow_step", not_negative)?);
         put(
             given,
             "shadow_growth",

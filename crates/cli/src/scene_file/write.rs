@@ -57,6 +57,8 @@ pub(crate) fn save(plan: &Plan, run: &RunKeys, folder: &Path) -> String {
             ("time", look.time.map(|time| time.to_string())),
             ("seed", Some(look.seed.to_string())),
             ("scatterings", look.scatterings.map(|most| most.to_string())),
+            ("filter", look.filter.to_possible_value().map(|value| quoted(value.get_name()))),
+            ("lod", Some(look.lod.to_string())),
             ("step", Some(look.step.to_string())),
             ("shadow_step", Some(look.shadow_step.to_string())),
             ("shadow_growth", Some(look.shadow_growth.to_string())),

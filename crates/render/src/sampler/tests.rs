@@ -42,7 +42,7 @@ fn coordinates_are_sobols() {
 
 #[test]
 fn first_pairs_hit_every_elementary_box_once() {
-    for (pixel, set) in [(0, 0), (1, 0), (77, 3), (500, EVEN_SETS - 1)] {
+    for (pixel, set) in [(0, 0), (1, 0), (77, 1), (500, EVEN_SETS - 1)] {
         for m in 0..=10 {
             // Any aligned block of samples, not only the first.
             for block in [0, 5, 256] {
@@ -56,7 +56,7 @@ fn first_pairs_hit_every_elementary_box_once() {
 
 #[test]
 fn all_pairs_fill_boxes_of_eight_evenly() {
-    for (pixel, set) in [(4, 0), (77, 3)] {
+    for (pixel, set) in [(4, 0), (77, 2)] {
         for m in 3..=11 {
             let points: Vec<_> = (0..1 << m).map(|i| set_of(pixel, i, set)).collect();
             for (a, b) in [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)] {
@@ -98,7 +98,7 @@ fn four_coordinates_fill_boxes_together() {
 
 #[test]
 fn numbers_of_one_sample_are_uniform_over_pixels() {
-    for (set, sample) in [(0, 0), (0, 1), (2, 0), (7, 1_500_000), (EVEN_SETS, 3)] {
+    for (set, sample) in [(0, 0), (0, 1), (2, 0), (1, 1_500_000), (EVEN_SETS, 3)] {
         for (a, b) in [(0usize, 1usize), (2, 3), (0, 3), (1, 2)] {
             let mut counts = vec![0u32; 32 * 32];
             for pixel in 0..1 << 15 {
@@ -124,7 +124,7 @@ fn pixels_sets_samples_and_seeds_are_independent() {
         ("y", &|i, j| [first(i, j, 5, 0, 0), first(i, j + 1, 5, 0, 0)]),
         ("seeds", &|i, j| [first(i, j, 5, 0, 0), first(i, j, 5, 1, 0)]),
         ("sets", &|i, j| [first(i, j, 5, 0, 0), first(i, j, 5, 0, 1)]),
-        ("late sets", &|i, j| [first(i, j, 5, 0, 4), first(i, j, 5, 0, 9)]),
+        ("late sets", &|i, j| [first(i, j, 5, 0, EVEN_SETS - 1), first(i, j, 5, 0, EVEN_SETS)]),
         // Of one pixel over its samples: independent, though each for itself is even.
         ("sets over samples", &|i, j| [first(3, 3, i + 512 * j, 0, 1), first(3, 3, i + 512 * j, 0, 2)]),
     ];
@@ -218,13 +218,14 @@ fn numbers_keep_their_places() {
     let random = sampler.random();
     assert_eq!(sampler.next_2d(), [plain[2], plain[3]]);
     assert_ne!(sampler.random(), random);
-    assert_eq!(sampler.next_2d(), [plain[4], plain[5]]);
-    sampler.next_1d();
-    sampler.next_1d();
-    assert_eq!(sampler.next_1d(), plain[8]);
+    // After the last of a set numbers are random, and a set begins with its own wherever one comes from.
+    assert_ne!(sampler.next_1d(), plain[4]);
     sampler.start_set(1);
-    assert_eq!(sampler.next_1d(), plain[4]);
-    // The next set follows the last of one, also where numbers turn random, and at the very end.
+    let first = sampler.next_1d();
+    sampler.start_set(0);
+    assert_eq!(sampler.next_1d(), plain[0]);
+    sampler.start_set(1);
+    assert_eq!(sampler.next_1d(), first);
     for set in [EVEN_SETS - 1, u32::MAX] {
         sampler.start_set(set);
         assert!(all(&mut sampler).iter().all(|v| (0.0..1.0).contains(v)));
