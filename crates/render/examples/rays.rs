@@ -2,20 +2,21 @@
 //!
 //! `cargo run --release -p nuage-render --example rays -- FILE.vdb KERNEL THREADS REPEATS [SIZE [PICTURE.f32 [SEED]]]`
 //! prints one line: `median_ms=... min_ms=... cpu_ms=... mean=...`. Reading the file is not timed, and one picture is made before
-//! the first that is. The view, the kernels and the picture are those of `bench/peers/nanovdb_rays.cc`, which says more.
+//! the first that is. The view, the kernels and the picture are those of `bench/peers/nanovdb_rays.cc`, which says more; what it calls
+//! `surface` is `voxel` here, for it finds the first voxel behind the surface, and `surface` is where the interpolation reaches it.
 
 #![allow(clippy::print_stdout, reason = "the line printed is what the program is for")]
 
 use std::error::Error;
 use std::time::Instant;
 
-use glam::{DVec2, DVec3};
+use glam::{DVec2, DVec3, IVec3, Vec3};
 use nuage_pipeline::import::{import, import_surface};
 use nuage_render::camera::{Camera, Ray};
 use nuage_render::filter::Filter;
 use nuage_render::hash::{hash_pixel, hash_u32, unit_f32};
 use nuage_render::packet::{
-    RAYS, SIDE, Surface, first_collisions, optical_depths, square, stepped_transmittances,
+    RAYS, SIDE, Surface, first_collisions, first_voxels, optical_depths, square, stepped_transmittances,
 };
 use nuage_render::traverse::{Field, Reader};
 use nuage_volume::channel::Channel;
@@ -80,6 +81,13 @@ fn median(values: &mut [f64]) -> f64 {
 /// What a kernel makes of the pixels of a packet.
 type Kernel<'r, 'a> = Box<dyn Fn(&mut Reader<'a>, [[u32; 2]; RAYS]) -> [f32; RAYS] + Sync + 'r>;
 
+/// The cosine between a ray and the slope at a voxel, over its neighbours along each axis. Voxels are taken to be cubes.
+fn facing(reader: &mut Reader<'_>, voxel: IVec3, ray: &Ray) -> f32 {
+    let mut along = |axis| reader.walker.voxel(voxel + axis) - reader.walker.voxel(voxel - axis);
+    let slope = Vec3::new(along(IVec3::X), along(IVec3::Y), along(IVec3::Z));
+    slope.normalize_or_zero().dot(ray.direction.as_vec3()).abs()
+}
+
 fn kernel_of<'r, 'a: 'r>(
     kernel: &str,
     field: &'r Field<'a>,
@@ -110,6 +118,19 @@ fn kernel_of<'r, 'a: 'r>(
             let hits = first_collisions(field, reader, &rays(&pixels), extinction, random);
             hits.map(|hit| f32::from(hit.is_some()))
         }),
+        "voxel" | "voxel-shaded" => {
+            let is_shaded = kernel == "voxel-shaded";
+            Box::new(move |reader, pixels| {
+                let rays = rays(&pixels);
+                let hits = first_voxels(field, reader, &rays, level);
+                std::array::from_fn(|i| {
+                    hits[i].map_or(0.0, |hit| match is_shaded {
+                        true => facing(reader, hit.voxel, &rays[i]),
+                        false => (hit.distance / voxel_size) as f32,
+                    })
+                })
+            })
+        }
         "surface" | "surface-shaded" => {
             let is_shaded = kernel == "surface-shaded";
             let surface = Surface::new(field, level);
@@ -136,12 +157,13 @@ fn main() -> Result<(), Box<dyn Error>> {
     let repeats: usize = repeats.parse()?;
     let size: u32 = rest.first().map_or(Ok(1024), |size| size.parse())?;
     let seed: u32 = rest.get(2).map_or(Ok(0), |seed| seed.parse())?;
-    let (channel, level) = channel(path, kernel.starts_with("surface"))?;
+    let (channel, level) = channel(path, kernel.starts_with("surface") || kernel.starts_with("voxel"))?;
     let field = Field::new(&channel).ok_or("the grid is empty")?;
     let active = channel.active_box.ok_or("the grid is empty")?;
     let (low, extent) = (active.min.as_dvec3(), (active.max - active.min + 1).as_dvec3());
     // Voxels of NanoVDB's nearest filter begin at their place; ours are centred on it.
-    let shift = if kernel == "nearest" || kernel == "exact" { 0.5 } else { 0.0 };
+    let shift =
+        if matches!(kernel.as_str(), "nearest" | "exact" | "voxel" | "voxel-shaded") { 0.5 } else { 0.0 };
     let target = low + 0.5 * extent - shift;
     let eye = target + DVec3::new(0.0, 0.0, 2.0 * extent.z);
     let world = |p: DVec3| channel.world_from_index.transform_point3(p);

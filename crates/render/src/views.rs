@@ -7,9 +7,9 @@ use crate::camera::{Camera, Ray};
 use crate::film::{Image, ImageSizeError};
 use crate::filter::Filter;
 use crate::math::one_minus_exp_neg;
-use crate::packet::{RAYS, Surface, optical_depths};
+use crate::packet::{RAYS, Surface, first_voxels, optical_depths};
 use crate::picture::each_packet;
-use crate::surface::{VoxelHit, first_voxel};
+use crate::surface::VoxelHit;
 use crate::traverse::{Field, Reader};
 
 /// What a view shows of the voxels along a ray.
@@ -77,8 +77,8 @@ impl<'f, 'a> Viewer<'f, 'a> {
                 })
             });
         }
-        std::array::from_fn(|i| {
-            first_voxel(self.field, reader, &rays[i], 0.0).map_or([0.0; 4], |hit| {
+        first_voxels(self.field, reader, rays, 0.0).map(|hit| {
+            hit.map_or([0.0; 4], |hit| {
                 let [r, g, b] = self.colour(&hit);
                 [r, g, b, 1.0]
             })

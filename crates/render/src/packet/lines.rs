@@ -107,7 +107,7 @@ fn sight_of(filter: Filter) -> (Sight, f64) {
 
 /// The values of voxels in bricks; those of special cells of the map; 0 where cells are empty.
 #[inline(always)]
-fn values_of<S: Simd, V: Stored>(
+pub(super) fn values_of<S: Simd, V: Stored>(
     lanes: &Lanes<'_, S>,
     values: &[V],
     cells: i32x16<S>,

@@ -23,10 +23,12 @@ use crate::walk::{BORDER, BrickMap, SPECIAL};
 mod lines;
 mod surfaces;
 mod tracks;
+mod voxels;
 
 pub use lines::{optical_depths, stepped_transmittances};
 pub use surfaces::Surface;
 pub use tracks::first_collisions;
+pub use voxels::first_voxels;
 
 /// Rays of a packet.
 pub const RAYS: usize = 16;
