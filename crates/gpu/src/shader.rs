@@ -295,7 +295,6 @@ fn prelude(features: &Features) -> String {
     p.f("LOG2_E", std::f32::consts::LOG2_E);
     p.f("PI", std::f32::consts::PI);
     p.f("TAU", std::f32::consts::TAU);
-    p.f("ROUND", math::ROUND);
     p.f("LN_2_HIGH", math::LN_2_HIGH);
     p.f("LN_2_LOW", math::LN_2_LOW);
     p.f("EXP_LOWEST", math::EXP_LOWEST);

@@ -9,7 +9,7 @@
 
 /// Adding this to a float of magnitude below 2^22 rounds it to the nearest integer (ties to even) and leaves
 /// that integer in the low mantissa bits: a rounding without a call or a conversion. It is 1.5 · 2^23.
-pub const ROUND: f32 = 12_582_912.0;
+const ROUND: f32 = 12_582_912.0;
 
 /// ln 2 in two parts. The first has few enough bits that its product with any exponent is exact.
 pub const LN_2_HIGH: f32 = 0.693_359_4;

@@ -2,10 +2,11 @@
 // stop. Capitals behind a dollar sign are put in from Rust; a body sees all names below, and ends the walk by `return`.
 
 fn $NAME(field: u32, ray: LocalRay, begin: f32, end: f32, state: ptr<function, $STATE>) {
-    var runs = runs_between(field, new_accessor(), ray, begin, end);
+    var accessor = new_accessor();
+    var runs = runs_between(field, ray, begin, end);
     while (runs.t < runs.t_end) {
         let brick = runs.brick;
-        let region = region_at(field, &runs.accessor, brick);
+        let region = region_at(field, &accessor, brick);
         let t0 = runs.t;
         pass_region(&runs, region.log2_bricks);
         let t1 = min(runs.t, runs.t_end);

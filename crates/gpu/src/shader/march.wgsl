@@ -52,24 +52,8 @@ struct Lighting {
     random: u32,
 }
 
-// What samples of density and of the channel that glows remember, and shadow rays.
-var<private> sampler_accessor: Accessor;
-var<private> glow_accessor: Accessor;
+// What shadow rays remember.
 var<private> shadow_accessor: Accessor;
-
-fn sample_density(field: u32, position: vec3<f32>) -> f32 {
-    var accessor = sampler_accessor;
-    let value = trilinear(field, &accessor, position);
-    sampler_accessor = accessor;
-    return value;
-}
-
-fn sample_glow(field: u32, position: vec3<f32>) -> f32 {
-    var accessor = glow_accessor;
-    let value = trilinear(field, &accessor, position);
-    glow_accessor = accessor;
-    return value;
-}
 
 fn new_lighting(field: u32, ray: Ray, start: f32, local: LocalRay, random: u32) -> Lighting {
     var lighting: Lighting;
@@ -93,9 +77,10 @@ fn new_lighting(field: u32, ray: Ray, start: f32, local: LocalRay, random: u32) 
 // The optical depth of a ray up to `end`, given up once it passes `limit`.
 fn optical_depth(field: u32, ray: LocalRay, end: f32, lattice: Lattice, scale: f32, limit: f32) -> f32 {
     var depth = 0.0;
-    var runs = runs_between(field, shadow_accessor, ray, 0.0, end);
+    var accessor = shadow_accessor;
+    var runs = runs_between(field, ray, 0.0, end);
     loop {
-        let found = next_run(&runs);
+        let found = next_run(&runs, &accessor);
         if (!found.is_there) {
             break;
         }
@@ -106,7 +91,7 @@ fn optical_depth(field: u32, ray: LocalRay, end: f32, lattice: Lattice, scale: f
                 if (step.x >= step.y) {
                     break;
                 }
-                let value = trilinear(field, &runs.accessor, ray_at(ray, 0.5 * (step.x + step.y)));
+                let value = trilinear(field, &accessor, ray_at(ray, 0.5 * (step.x + step.y)));
                 depth += value * scale * (step.y - step.x);
                 if (depth > limit) {
                     break;
@@ -119,7 +104,7 @@ fn optical_depth(field: u32, ray: LocalRay, end: f32, lattice: Lattice, scale: f
             break;
         }
     }
-    shadow_accessor = runs.accessor;
+    shadow_accessor = accessor;
     return depth;
 }
 
@@ -234,15 +219,15 @@ fn march_radiance(ray: Ray, max_distance: f32, random: u32) -> vec4<f32> {
     let is_lit = lighting.has_sun || lighting.has_sky;
     let scale = params.extinction.x;
 
-    sampler_accessor = new_accessor();
-    glow_accessor = new_accessor();
+    var walker = new_accessor();
+    var glow_walker = new_accessor();
     shadow_accessor = new_accessor();
-    var runs = runs_between(density, new_accessor(), local, density_span.x, select(density_span.x, density_span.y, has_density));
-    var glow_runs = runs_between(glow, new_accessor(), glow_local, glow_span.x, select(glow_span.x, glow_span.y, has_glow));
-    var head = next_run(&runs);
+    var runs = runs_between(density, local, density_span.x, select(density_span.x, density_span.y, has_density));
+    var glow_runs = runs_between(glow, glow_local, glow_span.x, select(glow_span.x, glow_span.y, has_glow));
+    var head = next_run(&runs, &walker);
     var glow_head = FoundRun(false, Run(0.0, 0.0, false, 0.0));
     if (HAS_EMISSION) {
-        glow_head = next_run(&glow_runs);
+        glow_head = next_run(&glow_runs, &glow_walker);
     }
     while ((head.is_there || glow_head.is_there) && transmittance > params.march.w) {
         // The next piece: it ends where a run that covers its start ends, or where another begins.
@@ -292,13 +277,13 @@ fn march_radiance(ray: Ray, max_distance: f32, random: u32) -> vec4<f32> {
             let t = 0.5 * (step.x + step.y);
             var value = constant_density;
             if (density_varies) {
-                value = sample_density(density, ray_at(local, t));
+                value = trilinear(density, &walker, ray_at(local, t));
             }
             var emitted = vec3<f32>(0.0);
             if (HAS_EMISSION && glows) {
                 var glow_value = constant_glow;
                 if (glow_varies) {
-                    glow_value = sample_glow(glow, ray_at(glow_local, t));
+                    glow_value = trilinear(glow, &glow_walker, ray_at(glow_local, t));
                 }
                 emitted = spectrum_radiance(glow_value);
             }
@@ -323,13 +308,13 @@ fn march_radiance(ray: Ray, max_distance: f32, random: u32) -> vec4<f32> {
         if (is_dense) {
             head.run.t0 = t1;
             if (t1 >= head.run.t1) {
-                head = next_run(&runs);
+                head = next_run(&runs, &walker);
             }
         }
         if (HAS_EMISSION && glows) {
             glow_head.run.t0 = t1;
             if (t1 >= glow_head.run.t1) {
-                glow_head = next_run(&glow_runs);
+                glow_head = next_run(&glow_runs, &glow_walker);
             }
         }
     }

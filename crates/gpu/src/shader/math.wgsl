@@ -4,13 +4,13 @@
 struct Reduced { q: f32, n: u32 }
 
 fn reduce(x: f32) -> Reduced {
-    let shifted = x * LOG2_E + ROUND;
-    let n = shifted - ROUND;
+    // Rounded by name: drivers take adding and subtracting a large number for nothing.
+    let n = round(x * LOG2_E);
     let r = (x - n * LN_2_HIGH) - n * LN_2_LOW;
     let rr = r * r;
     let high = (EXP_SERIES_2 + EXP_SERIES_3 * r) + rr * EXP_SERIES_4;
     let p = (EXP_SERIES_0 + EXP_SERIES_1 * r) + rr * high;
-    return Reduced(r + rr * p, bitcast<u32>(shifted));
+    return Reduced(r + rr * p, u32(i32(n)));
 }
 
 // What is beyond the largest float is the largest float here: WGSL promises no infinities.
@@ -39,9 +39,9 @@ fn ln(x: f32) -> f32 {
 
 // Sine and cosine of an angle in turns.
 fn sin_cos_turns(turns: f32) -> vec2<f32> {
-    let shifted = turns * 4.0 + ROUND;
-    let quarter = bitcast<u32>(shifted);
-    let x = turns - (shifted - ROUND) * 0.25;
+    let quarters = round(turns * 4.0);
+    let quarter = u32(i32(quarters));
+    let x = turns - quarters * 0.25;
     let y = x * x;
     var s = SIN_SERIES_0;
     s = s * y + SIN_SERIES_1;

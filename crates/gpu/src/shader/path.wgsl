@@ -27,15 +27,16 @@ fn emitted_between(ray: Ray, begin: f32, end: f32, random: ptr<function, Random>
         return light;
     }
     let local = moved(field, ray, start);
-    var runs = runs_between(field, new_accessor(), local, 0.0, length);
+    var accessor = new_accessor();
+    var runs = runs_between(field, local, 0.0, length);
     loop {
-        let segment = next_segment(&runs);
+        let segment = next_segment(&runs, &accessor);
         if (!segment.is_there) {
             break;
         }
         let length = segment.t1 - segment.t0;
         let t = segment.t0 + random_unit(random) * length;
-        light += spectrum_radiance(trilinear(field, &runs.accessor, ray_at(local, t))) * length;
+        light += spectrum_radiance(trilinear(field, &accessor, ray_at(local, t))) * length;
     }
     return light;
 }
@@ -54,10 +55,11 @@ fn fly(
     var collision = -1.0;
     if (length > 0.0) {
         let local = moved(field, ray, span.x);
-        var runs = runs_between(field, new_accessor(), local, 0.0, length);
+        var accessor = new_accessor();
+        var runs = runs_between(field, local, 0.0, length);
         var depth = random_depth(random);
         loop {
-            let segment = next_segment(&runs);
+            let segment = next_segment(&runs, &accessor);
             if (!segment.is_there || collision >= 0.0) {
                 break;
             }
@@ -72,7 +74,7 @@ fn fly(
                 t += depth / majorant;
                 var part = 1.0;
                 if (segment.min != segment.max) {
-                    part = min(trilinear(field, &runs.accessor, ray_at(local, t)) / segment.max, 1.0);
+                    part = min(trilinear(field, &accessor, ray_at(local, t)) / segment.max, 1.0);
                 }
                 var is_real: bool;
                 if (IS_GREY) {
@@ -112,11 +114,12 @@ fn transmittance(ray: Ray, limit: f32, random: ptr<function, Random>) -> vec3<f3
         return ratio;
     }
     let local = moved(field, ray, span.x);
-    var runs = runs_between(field, new_accessor(), local, 0.0, end - span.x);
+    var accessor = new_accessor();
+    var runs = runs_between(field, local, 0.0, end - span.x);
     var known = 0.0;
     var depth = random_depth(random);
     loop {
-        let segment = next_segment(&runs);
+        let segment = next_segment(&runs, &accessor);
         if (!segment.is_there) {
             break;
         }
@@ -133,7 +136,7 @@ fn transmittance(ray: Ray, limit: f32, random: ptr<function, Random>) -> vec3<f3
                 break;
             }
             t += depth / (residual * scale);
-            let part = (trilinear(field, &runs.accessor, ray_at(local, t)) - segment.min) / residual;
+            let part = (trilinear(field, &accessor, ray_at(local, t)) - segment.min) / residual;
             ratio *= max(1.0 - part * shares, vec3<f32>(0.0));
             depth = random_depth(random);
         }

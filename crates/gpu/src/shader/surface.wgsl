@@ -34,10 +34,11 @@ fn meet_in_cell(c: array<f32, 8>, origin: vec3<f32>, direction: vec3<f32>, t0: f
 
 // The distance along the local ray of the surface; negative if it is not met.
 fn first_hit(field: u32, ray: LocalRay, end: f32, surface: f32) -> f32 {
-    var runs = runs_between(field, new_accessor(), ray, 0.0, end);
+    var accessor = new_accessor();
+    var runs = runs_between(field, ray, 0.0, end);
     while (runs.t < runs.t_end) {
         let brick = runs.brick;
-        let region = region_at(field, &runs.accessor, brick);
+        let region = region_at(field, &accessor, brick);
         let bounds = footprint(field, brick, region);
         let begin = runs.t;
         if (bounds.y < surface) {
@@ -60,7 +61,7 @@ fn first_hit(field: u32, ray: LocalRay, end: f32, surface: f32) -> f32 {
                 continue;
             }
             let first = corner + vec3<f32>(cell.local);
-            let c = corners_of(field, &runs.accessor, vec3<i32>(first) + base_voxel(field));
+            let c = corners_of(field, &accessor, vec3<i32>(first) + base_voxel(field));
             if (surface_value(c, ray.origin - first, ray.direction, cell.t1, surface) >= 0.0) {
                 return meet_in_cell(c, ray.origin - first, ray.direction, cell.t0, cell.t1, surface);
             }

@@ -28,9 +28,9 @@ fn twins(@builtin(global_invocation_id) id: vec3<u32>) {
         }
         default: {
             // A voxel of a brick whose tag and offset are given, in units of the first field.
-            let voxel = bits.z;
+            let voxel = u32(given.z);
             let p = vec3<u32>(voxel >> 6u, (voxel >> 3u) & 7u, voxel & 7u);
-            result.x = stored_value(0u, Entry(bits.y, bits.x), p);
+            result.x = stored_value(0u, Entry(u32(given.x), u32(given.y)), p);
         }
     }
     picture[at] = result;

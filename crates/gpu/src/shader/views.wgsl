@@ -26,9 +26,10 @@ fn line_integral(field: u32, ray: Ray) -> f32 {
     }
     let local = moved(field, ray, span.x);
     var sum = 0.0;
-    var runs = runs_between(field, new_accessor(), local, 0.0, span.y - span.x);
+    var accessor = new_accessor();
+    var runs = runs_between(field, local, 0.0, span.y - span.x);
     loop {
-        let found = next_run(&runs);
+        let found = next_run(&runs, &accessor);
         if (!found.is_there) {
             break;
         }
@@ -50,7 +51,7 @@ fn line_integral(field: u32, ray: Ray) -> f32 {
                     continue;
                 }
                 let first = corner + vec3<f32>(cell.local);
-                let c = corners_of(field, &runs.accessor, vec3<i32>(first) + base_voxel(field));
+                let c = corners_of(field, &accessor, vec3<i32>(first) + base_voxel(field));
                 let middle = ray_at(local, 0.5 * (cell.t0 + cell.t1)) - first;
                 let apart = local.direction * (half * GAUSS_NODE);
                 sum += half * (lerp8(c, middle - apart) + lerp8(c, middle + apart));

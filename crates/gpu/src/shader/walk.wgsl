@@ -60,7 +60,6 @@ struct Run { t0: f32, t1: f32, is_varying: bool, value: f32 }
 struct Runs {
     field: u32,
     ray: LocalRay,
-    accessor: Accessor,
     // The brick to look at next, in the tree, and where the ray enters it.
     brick: vec3<i32>,
     t: f32,
@@ -91,14 +90,13 @@ fn brick_of_position(field: u32, position: vec3<f32>) -> vec3<i32> {
 }
 
 // The runs of a ray between two distances inside the field.
-fn runs_between(field: u32, accessor: Accessor, ray: LocalRay, t0: f32, t1: f32) -> Runs {
+fn runs_between(field: u32, ray: LocalRay, t0: f32, t1: f32) -> Runs {
     let forward = ray.direction >= vec3<f32>(0.0);
     let box_first = fields[field].box_first.xyz;
     let box_last = fields[field].box_last.xyz;
     var runs: Runs;
     runs.field = field;
     runs.ray = ray;
-    runs.accessor = accessor;
     runs.brick = clamp(brick_of_position(field, ray_at(ray, t0)), box_first, box_last);
     runs.t = t0;
     runs.t_end = t1;
@@ -202,10 +200,10 @@ fn pass_region(runs: ptr<function, Runs>, log2_bricks: u32) {
 struct Segment { is_there: bool, t0: f32, t1: f32, min: f32, max: f32 }
 
 // The next region that is not empty. To be used instead of `next_run`.
-fn next_segment(runs: ptr<function, Runs>) -> Segment {
+fn next_segment(runs: ptr<function, Runs>, accessor: ptr<function, Accessor>) -> Segment {
     while ((*runs).t < (*runs).t_end) {
         let brick = (*runs).brick;
-        let region = region_at((*runs).field, &(*runs).accessor, brick);
+        let region = region_at((*runs).field, accessor, brick);
         let bounds = footprint((*runs).field, brick, region);
         let t0 = (*runs).t;
         pass_region(runs, region.log2_bricks);
@@ -256,14 +254,14 @@ fn waiting_run(runs: ptr<function, Runs>) -> FoundRun {
 }
 
 // The next run. Varying bricks that touch come as one.
-fn next_run(runs: ptr<function, Runs>) -> FoundRun {
+fn next_run(runs: ptr<function, Runs>, accessor: ptr<function, Accessor>) -> FoundRun {
     if ((*runs).waiting_count > 0u) {
         return waiting_run(runs);
     }
-    var varying = FoundRun(false, Run(0.0, 0.0, true, 0.0));
+    var joined = FoundRun(false, Run(0.0, 0.0, true, 0.0));
     while ((*runs).t < (*runs).t_end) {
         let brick = (*runs).brick;
-        let region = region_at((*runs).field, &(*runs).accessor, brick);
+        let region = region_at((*runs).field, accessor, brick);
         let bounds = footprint((*runs).field, brick, region);
         let t0 = (*runs).t;
         pass_region(runs, region.log2_bricks);
@@ -276,24 +274,24 @@ fn next_run(runs: ptr<function, Runs>) -> FoundRun {
                 if (region.log2_bricks == LOG2_NODE5_BRICKS) {
                     leap_to_root_entry(runs);
                 }
-                if (varying.is_there) {
+                if (joined.is_there) {
                     break;
                 }
                 continue;
             }
             wait_with(runs, Run(t0, t1, false, bounds.y));
         } else if (region.log2_bricks == 0u) {
-            varying = FoundRun(true, Run(select(t0, varying.run.t0, varying.is_there), t1, true, 0.0));
+            joined = FoundRun(true, Run(select(t0, joined.run.t0, joined.is_there), t1, true, 0.0));
             continue;
         } else {
             split_tile(runs, brick, region, t0, t1);
         }
-        if (varying.is_there || (*runs).waiting_count > 0u) {
+        if (joined.is_there || (*runs).waiting_count > 0u) {
             break;
         }
     }
-    if (varying.is_there) {
-        return varying;
+    if (joined.is_there) {
+        return joined;
     }
     return waiting_run(runs);
 }
