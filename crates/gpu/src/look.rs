@@ -47,14 +47,14 @@ pub enum Pass {
     },
     /// Single scattering, as `nuage_render::march`.
     March(Quality),
-    /// Multiple scattering, as `nuage_render::path`: adds paths to those that are there.
+    /// Multiple scattering, as `nuage_render::path`: adds one path to those that each pixel has.
+    ///
+    /// One, so that no pass lasts long: drivers end passes of seconds, and lavapipe leaves loops after 65535 turns in all.
     Path {
         /// How paths are made.
         settings: PathSettings,
-        /// The number of the first one; at 0 the picture begins anew.
-        first_sample: u32,
-        /// How many for each pixel.
-        samples: u32,
+        /// The number of the path; at 0 the picture begins anew.
+        sample: u32,
     },
 }
 
@@ -148,11 +148,10 @@ impl Look {
             Pass::Hits => params.counts[2] = 4,
             Pass::SurfaceHits { level } => (params.counts[2], params.view[3]) = (4, level),
             Pass::March(quality) => self.march(&mut params, quality),
-            Pass::Path { settings, first_sample, samples } => {
-                params.size[3] = first_sample;
-                params.counts[0] = samples;
+            Pass::Path { settings, sample } => {
+                params.size[3] = sample;
                 params.counts[1] = settings.max_scatterings.unwrap_or(u32::MAX);
-                params.tone[1] = 1.0 / first_sample.saturating_add(samples).max(1) as f32;
+                params.tone[1] = 1.0 / sample.saturating_add(1) as f32;
             }
         }
         Ok(params)

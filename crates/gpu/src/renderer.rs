@@ -170,7 +170,7 @@ impl Renderer {
             let bytes = bytemuck::cast_slice(table.table());
             self.gpu.guarded(|| self.gpu.queue().write_buffer(volume.tables(), at, bytes))?;
         }
-        let is_first = !matches!(pass, Pass::Path { first_sample: 1.., .. });
+        let is_first = !matches!(pass, Pass::Path { sample: 1.., .. });
         self.prepared = Some((key, is_first));
         self.current = params;
         self.write_params()

@@ -38,16 +38,15 @@ fn lerp8(c: array<f32, 8>, f: vec3<f32>) -> f32 {
 // The eight values of the cell whose lower corner is a voxel.
 fn corners_of(field: u32, accessor: ptr<function, Accessor>, cell: vec3<i32>) -> array<f32, 8> {
     var corners: array<f32, 8>;
-    let is_inside = all(cell >= fields[field].active_min.xyz) && all(cell < fields[field].active_max.xyz);
-    if (is_inside && all((cell & vec3<i32>(7)) != vec3<i32>(7))) {
-        let region = region_at(field, accessor, cell >> vec3<u32>(LOG2_BRICK));
-        for (var i = 0; i < 8; i++) {
-            corners[i] = in_region(field, region, cell + vec3<i32>(i >> 2u, (i >> 1u) & 1, i & 1));
+    var brick = cell >> vec3<u32>(LOG2_BRICK);
+    var region = region_at(field, accessor, brick);
+    for (var i = 0; i < 8; i++) {
+        let index = cell + vec3<i32>(i >> 2u, (i >> 1u) & 1, i & 1);
+        if (any(index >> vec3<u32>(LOG2_BRICK) != brick)) {
+            brick = index >> vec3<u32>(LOG2_BRICK);
+            region = region_at(field, accessor, brick);
         }
-    } else {
-        for (var i = 0; i < 8; i++) {
-            corners[i] = voxel_value(field, accessor, cell + vec3<i32>(i >> 2u, (i >> 1u) & 1, i & 1));
-        }
+        corners[i] = select(0.0, in_region(field, region, index), is_active(field, index));
     }
     return corners;
 }

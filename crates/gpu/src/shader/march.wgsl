@@ -120,17 +120,6 @@ fn march_transmittance(lighting: ptr<function, Lighting>, t: f32, direction: vec
     return exp_(-depth);
 }
 
-// The sun's light that the steps since the last call scatter towards the camera.
-fn close_group(lighting: ptr<function, Lighting>) -> vec3<f32> {
-    let group = (*lighting).group;
-    (*lighting).group = Group(0.0, 0.0, 0.0);
-    if (!(*lighting).has_sun || group.share <= 0.0) {
-        return vec3<f32>(0.0);
-    }
-    let direction = (*lighting).sun_direction;
-    return (*lighting).sun * group.share * march_transmittance(lighting, group.moment / group.share, direction);
-}
-
 // The next direction towards the sky, in the field's positions, drawn from the phase function.
 fn sky_direction(lighting: ptr<function, Lighting>) -> vec3<f32> {
     let start = hash_u32((*lighting).random ^ SKY_DIRECTION_SEED);
@@ -141,49 +130,63 @@ fn sky_direction(lighting: ptr<function, Lighting>) -> vec3<f32> {
 }
 
 // The light scattered towards the camera by a step that accounts for `share` of the camera's light, or by a group of
-// steps that ends with it.
-fn step_light(lighting: ptr<function, Lighting>, t0: f32, t1: f32, share: f32) -> vec3<f32> {
+// steps that ends with it. The last step accounts for nothing, and ends what is left of a group.
+fn step_light(lighting: ptr<function, Lighting>, t0: f32, t1: f32, share: f32, is_last: bool) -> vec3<f32> {
     var light = vec3<f32>(0.0);
-    if ((*lighting).has_sun) {
-        let full = 1.0 / params.march_rays.x;
-        let missing = (full - (*lighting).group.share) / share;
-        let cut = select(t1, t0 + missing * (t1 - t0), missing < 1.0 && share < full);
-        for (var part = 0u; part < 2u; part++) {
+    let full = 1.0 / params.march_rays.x;
+    let missing = (full - (*lighting).group.share) / max(share, MIN_F32);
+    // A group is full in the midst of a step: what changes little is divided nearly the same.
+    let cut = select(t1, t0 + missing * (t1 - t0), missing < 1.0 && share < full && !is_last);
+    let before = (*lighting).scattered;
+    (*lighting).scattered += share;
+    // The parts of the step before and after the cut, then rays to the sky: one shadow ray at most in each turn.
+    var part = select(2u, 0u, (*lighting).has_sun);
+    loop {
+        var radiance = vec3<f32>(0.0);
+        var t = 0.0;
+        var direction = (*lighting).sun_direction;
+        if (part < 2u) {
             let begin = select(t0, cut, part == 1u);
             let end = select(cut, t1, part == 1u);
-            if (begin >= end) {
+            part += 1u;
+            if (begin >= end && !is_last) {
                 continue;
             }
             if ((*lighting).group.share == 0.0) {
                 (*lighting).group.start = begin;
             }
-            let part_share = share * ((end - begin) / (t1 - t0));
-            (*lighting).group.share += part_share;
-            (*lighting).group.moment += part_share * 0.5 * (begin + end);
-            let is_full = (*lighting).group.share >= full || (end == cut && cut < t1);
-            let is_faint = (*lighting).group.share < FAINT_GROUP * full;
-            let longest = select(GROUP_VOXELS, FAINT_GROUP_VOXELS, is_faint) / (*lighting).voxels_per_length;
-            if (is_full || end - (*lighting).group.start >= longest) {
-                light += close_group(lighting);
+            if (!is_last) {
+                let part_share = share * ((end - begin) / (t1 - t0));
+                (*lighting).group.share += part_share;
+                (*lighting).group.moment += part_share * 0.5 * (begin + end);
             }
-        }
-    }
-    if ((*lighting).has_sky) {
-        let before = (*lighting).scattered;
-        (*lighting).scattered += share;
-        let rays = params.march_rays.y;
-        while ((*lighting).scattered > (*lighting).next_sky) {
-            let part = clamp(((*lighting).next_sky - before) / share, 0.0, 1.0);
+            let group = (*lighting).group;
+            let is_full = group.share >= full || (end == cut && cut < t1);
+            let longest = select(GROUP_VOXELS, FAINT_GROUP_VOXELS, group.share < FAINT_GROUP * full);
+            let is_long = end - group.start >= longest / (*lighting).voxels_per_length;
+            if (!(is_full || is_long || is_last)) {
+                continue;
+            }
+            (*lighting).group = Group(0.0, 0.0, 0.0);
+            if (group.share <= 0.0) {
+                continue;
+            }
+            radiance = (*lighting).sun * group.share;
+            t = group.moment / group.share;
+        } else {
+            if (!(*lighting).has_sky || (*lighting).scattered <= (*lighting).next_sky) {
+                break;
+            }
+            let rays = params.march_rays.y;
+            t = t0 + clamp(((*lighting).next_sky - before) / share, 0.0, 1.0) * (t1 - t0);
             (*lighting).next_sky += 1.0 / rays;
-            let direction = sky_direction(lighting);
-            light += (*lighting).sky / rays * march_transmittance(lighting, t0 + part * (t1 - t0), direction);
+            direction = sky_direction(lighting);
+            radiance = (*lighting).sky / rays;
         }
+        light += radiance * march_transmittance(lighting, t, direction);
     }
     return light;
 }
-
-// A stretch of a ray on which each channel is of one kind: the runs of two channels, cut where either begins or ends.
-struct Piece { is_there: bool, t0: f32, t1: f32, density: FoundRun, glow: FoundRun }
 
 // The light from the medium along a ray, and the share of the light behind it that passes.
 fn march_radiance(ray: Ray, max_distance: f32, random: u32) -> vec4<f32> {
@@ -224,16 +227,22 @@ fn march_radiance(ray: Ray, max_distance: f32, random: u32) -> vec4<f32> {
     shadow_accessor = new_accessor();
     var runs = runs_between(density, local, density_span.x, select(density_span.x, density_span.y, has_density));
     var glow_runs = runs_between(glow, glow_local, glow_span.x, select(glow_span.x, glow_span.y, has_glow));
-    var head = next_run(&runs, &walker);
-    var glow_head = FoundRun(false, Run(0.0, 0.0, false, 0.0));
-    if (HAS_EMISSION) {
-        glow_head = next_run(&glow_runs, &glow_walker);
-    }
-    while ((head.is_there || glow_head.is_there) && transmittance > params.march.w) {
+    // The runs of both channels, cut where either begins or ends, and a last turn that ends what is lit together.
+    var head = FoundRun(true, Run(0.0, 0.0, false, 0.0));
+    var glow_head = FoundRun(HAS_EMISSION, Run(0.0, 0.0, false, 0.0));
+    var is_last = false;
+    while (!is_last) {
+        if (head.is_there && head.run.t0 >= head.run.t1) {
+            head = next_run(&runs, &walker);
+        }
+        if (HAS_EMISSION && glow_head.is_there && glow_head.run.t0 >= glow_head.run.t1) {
+            glow_head = next_run(&glow_runs, &glow_walker);
+        }
+        is_last = !(head.is_there || glow_head.is_there) || transmittance <= params.march.w;
         // The next piece: it ends where a run that covers its start ends, or where another begins.
         let t0 = min(select(MAX_F32, head.run.t0, head.is_there), select(MAX_F32, glow_head.run.t0, glow_head.is_there));
-        let is_dense = head.is_there && head.run.t0 <= t0;
-        let glows = glow_head.is_there && glow_head.run.t0 <= t0;
+        let is_dense = !is_last && head.is_there && head.run.t0 <= t0;
+        let glows = !is_last && glow_head.is_there && glow_head.run.t0 <= t0;
         var t1 = MAX_F32;
         if (head.is_there) {
             t1 = select(head.run.t0, head.run.t1, is_dense);
@@ -289,14 +298,17 @@ fn march_radiance(ray: Ray, max_distance: f32, random: u32) -> vec4<f32> {
             }
             let length = step.y - step.x;
             let depth = min(value * scale * length, MAX_F32);
-            if (depth <= 0.0) {
+            if (depth <= 0.0 && !is_last) {
                 scattered += transmittance * length * emitted;
                 continue;
             }
             let absorbed = one_minus_exp_neg(depth);
             let share = transmittance * absorbed;
             if (is_lit) {
-                scattered += step_light(&lighting, step.x, step.y, share);
+                scattered += step_light(&lighting, step.x, step.y, share, is_last);
+            }
+            if (is_last) {
+                break;
             }
             scattered += transmittance * (length * (absorbed / depth)) * emitted;
             transmittance *= 1.0 - absorbed;
@@ -305,20 +317,9 @@ fn march_radiance(ray: Ray, max_distance: f32, random: u32) -> vec4<f32> {
             }
         }
 
-        if (is_dense) {
-            head.run.t0 = t1;
-            if (t1 >= head.run.t1) {
-                head = next_run(&runs, &walker);
-            }
-        }
-        if (HAS_EMISSION && glows) {
-            glow_head.run.t0 = t1;
-            if (t1 >= glow_head.run.t1) {
-                glow_head = next_run(&glow_runs, &glow_walker);
-            }
-        }
+        head.run.t0 = select(head.run.t0, t1, is_dense);
+        glow_head.run.t0 = select(glow_head.run.t0, t1, glows);
     }
-    scattered += close_group(&lighting);
     return vec4<f32>(scattered, transmittance);
 }
 

@@ -237,20 +237,17 @@ fn path_light(first: Ray, limit: f32, seed: u32) -> vec4<f32> {
     return vec4<f32>(light, met);
 }
 
-// Adds paths to the sums of the picture; sample numbers go on from `params.size.w`.
+// Adds a path, the number of which is `params.size.w`, to the sums of the picture.
 @compute @workgroup_size(WORKGROUP_SIDE, WORKGROUP_SIDE)
 fn path(@builtin(global_invocation_id) id: vec3<u32>) {
     if (any(id.xy >= params.size.xy)) {
         return;
     }
-    var sum = vec4<f32>(0.0);
-    for (var i = 0u; i < params.counts.x; i++) {
-        let number = params.size.w + i;
-        let offset = vec2<f32>(
-            unit_f32(hash_pixel(id.x, id.y, number, 0u)), unit_f32(hash_pixel(id.x, id.y, number, 1u)),
-        );
-        let ray = camera_ray(vec2<f32>(id.xy) + offset);
-        sum += path_light(ray, end_of(id.xy, ray), hash_pixel(id.x, id.y, number, 2u));
-    }
-    store(id.xy, picture[id.y * params.size.x + id.x] + sum);
+    let number = params.size.w;
+    let offset = vec2<f32>(
+        unit_f32(hash_pixel(id.x, id.y, number, 0u)), unit_f32(hash_pixel(id.x, id.y, number, 1u)),
+    );
+    let ray = camera_ray(vec2<f32>(id.xy) + offset);
+    let light = path_light(ray, end_of(id.xy, ray), hash_pixel(id.x, id.y, number, 2u));
+    store(id.xy, picture[id.y * params.size.x + id.x] + light);
 }

@@ -70,8 +70,11 @@ struct Runs {
     sign: vec3<i32>,
     brick_end: vec3<i32>,
     root_leaps_left: u32,
-    waiting: array<Run, 3>,
-    waiting_count: u32,
+    // What was found and not yet given out: a varying run, one of a value, and a varying one, between these four
+    // distances; and how many of them are given out.
+    cuts: vec4<f32>,
+    value: f32,
+    given: u32,
 }
 
 fn faces_at(runs: ptr<function, Runs>, brick: vec3<i32>) -> vec3<f32> {
@@ -104,7 +107,7 @@ fn runs_between(field: u32, ray: LocalRay, t0: f32, t1: f32) -> Runs {
     runs.sign = select(vec3<i32>(-1), vec3<i32>(1), forward);
     runs.brick_end = select(box_first - 1, box_last + 1, forward);
     runs.root_leaps_left = MAX_ROOT_LEAPS;
-    runs.waiting_count = 0u;
+    runs.given = 3u;
     aim(&runs);
     return runs;
 }
@@ -218,17 +221,9 @@ fn next_segment(runs: ptr<function, Runs>, accessor: ptr<function, Accessor>) ->
     return Segment(false, 0.0, 0.0, 0.0, 0.0);
 }
 
-fn wait_with(runs: ptr<function, Runs>, run: Run) {
-    if (run.t0 < run.t1 && (run.is_varying || run.value != 0.0)) {
-        (*runs).waiting[(*runs).waiting_count] = run;
-        (*runs).waiting_count += 1u;
-    }
-}
-
 // Cuts the stretch of a large tile at its homogeneous part.
 fn split_tile(runs: ptr<function, Runs>, brick: vec3<i32>, region: Region, t0: f32, t1: f32) {
     let field = (*runs).field;
-    let value = in_region(field, region, vec3<i32>(0));
     let first = brick & vec3<i32>(-1 << region.log2_bricks);
     let low = vec3<f32>(first - fields[field].base_brick.xyz) * BRICK_SIDE;
     let side = f32(1u << (region.log2_bricks + LOG2_BRICK));
@@ -237,26 +232,39 @@ fn split_tile(runs: ptr<function, Runs>, brick: vec3<i32>, region: Region, t0: f
     if (inside.x < inside.y) {
         core = clamp(inside, vec2<f32>(t0), vec2<f32>(t1));
     }
-    wait_with(runs, Run(core.y, t1, true, 0.0));
-    wait_with(runs, Run(core.x, core.y, false, value));
-    wait_with(runs, Run(t0, core.x, true, 0.0));
+    // Only bricks are not of one value, and they are no tiles.
+    wait_with(runs, vec4<f32>(t0, core, t1), meant(field, bitcast<f32>(region.entry.payload)));
 }
 
 // A run that may not be there.
 struct FoundRun { is_there: bool, run: Run }
 
+fn wait_with(runs: ptr<function, Runs>, cuts: vec4<f32>, value: f32) {
+    (*runs).cuts = cuts;
+    (*runs).value = value;
+    (*runs).given = 0u;
+}
+
 fn waiting_run(runs: ptr<function, Runs>) -> FoundRun {
-    if ((*runs).waiting_count == 0u) {
-        return FoundRun(false, Run(0.0, 0.0, false, 0.0));
+    let cuts = (*runs).cuts;
+    while ((*runs).given < 3u) {
+        let number = (*runs).given;
+        (*runs).given += 1u;
+        let t0 = select(select(cuts.z, cuts.y, number == 1u), cuts.x, number == 0u);
+        let t1 = select(select(cuts.w, cuts.z, number == 1u), cuts.y, number == 0u);
+        let is_varying = number != 1u;
+        if (t0 < t1 && (is_varying || (*runs).value != 0.0)) {
+            return FoundRun(true, Run(t0, t1, is_varying, select((*runs).value, 0.0, is_varying)));
+        }
     }
-    (*runs).waiting_count -= 1u;
-    return FoundRun(true, (*runs).waiting[(*runs).waiting_count]);
+    return FoundRun(false, Run(0.0, 0.0, false, 0.0));
 }
 
 // The next run. Varying bricks that touch come as one.
 fn next_run(runs: ptr<function, Runs>, accessor: ptr<function, Accessor>) -> FoundRun {
-    if ((*runs).waiting_count > 0u) {
-        return waiting_run(runs);
+    let waiting = waiting_run(runs);
+    if (waiting.is_there) {
+        return waiting;
     }
     var joined = FoundRun(false, Run(0.0, 0.0, true, 0.0));
     while ((*runs).t < (*runs).t_end) {
@@ -279,14 +287,14 @@ fn next_run(runs: ptr<function, Runs>, accessor: ptr<function, Accessor>) -> Fou
                 }
                 continue;
             }
-            wait_with(runs, Run(t0, t1, false, bounds.y));
+            wait_with(runs, vec4<f32>(t0, t0, t1, t1), bounds.y);
         } else if (region.log2_bricks == 0u) {
             joined = FoundRun(true, Run(select(t0, joined.run.t0, joined.is_there), t1, true, 0.0));
             continue;
         } else {
             split_tile(runs, brick, region, t0, t1);
         }
-        if (joined.is_there || (*runs).waiting_count > 0u) {
+        if (joined.is_there || (*runs).given < 3u) {
             break;
         }
     }

@@ -106,7 +106,7 @@ pub fn cloud() -> Channel {
     channel_of([IVec3::new(-19, -53, 8), IVec3::new(45, 11, 72)], bent(), &[], |voxel| {
         let p = voxel.as_vec3();
         let inside = 1.0 - (p - centre).length() / 32.0;
-        (inside * 1.5 + noise(p / 9.0) + 0.5 * noise(p / 3.0) - 1.1).clamp(0.0, 1.0)
+        (inside * 1.5 + noise(p / 9.0) + 0.5 * noise(p / 3.0) - 0.7).clamp(0.0, 1.0)
     })
 }
 
@@ -148,7 +148,11 @@ pub fn tiles() -> Channel {
 pub fn camera_of(channel: &Channel) -> Camera {
     let world_box = nuage_render::framing::WorldBox::of(channel).expect("a place");
     let aspect = f64::from(SIZE[0]) / f64::from(SIZE[1]);
-    nuage_render::framing::fit_camera(world_box, DVec3::new(0.5, 0.35, 1.0), DVec3::Y, 35.0, aspect).expect("a view")
+    let camera = nuage_render::framing::fit_camera(world_box, DVec3::new(0.5, 0.35, 1.0), DVec3::Y, 35.0, aspect);
+    let mut camera = camera.expect("a view");
+    // Half as wide: most of the picture shows something.
+    camera.half_width_tangent *= 0.5;
+    camera
 }
 
 /// A cloud in the light of a sun and an even sky.
@@ -191,9 +195,19 @@ pub fn unpacked(asset: &Asset, frame: usize, name: &str) -> Channel {
     nuage_pipeline::import::import(grid).expect("a linear transform").0
 }
 
+/// A renderer of pictures to be compared. Keep it: its pipelines take seconds on a device in software.
+pub fn renderer(gpu: &Gpu) -> Renderer {
+    Renderer::new(gpu, SIZE).expect("a renderer")
+}
+
 /// The picture of a pass.
-pub fn picture(gpu: &Gpu, volume: &GpuVolume, look: &Look, pass: &Pass, frame: usize) -> Vec<[f32; 4]> {
-    let mut renderer = Renderer::new(gpu, SIZE).expect("a renderer");
+pub fn picture(
+    renderer: &mut Renderer,
+    volume: &GpuVolume,
+    look: &Look,
+    pass: &Pass,
+    frame: usize,
+) -> Vec<[f32; 4]> {
     renderer.prepare(volume, look, pass, frame, None).expect("a pass");
     renderer.run(volume).expect("a run");
     renderer.pixels().expect("pixels")
