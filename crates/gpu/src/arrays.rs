@@ -153,14 +153,17 @@ impl Arrays {
         form: Bricks,
     ) -> Result<Arrays, GpuError> {
         let contents = asset.contents();
-        let frames = contents.frames.get(frames.clone()).filter(|frames| !frames.is_empty()).ok_or_else(|| {
-            let count = contents.frames.len();
-            GpuError::Misuse(format!("frames {} to {} of {count}", frames.start, frames.end))
-        })?;
-        let mut arrays = Arrays { channels: wanted.len(), largest: vec![0.0; wanted.len()], ..Arrays::default() };
+        let frames =
+            contents.frames.get(frames.clone()).filter(|frames| !frames.is_empty()).ok_or_else(|| {
+                let count = contents.frames.len();
+                GpuError::Misuse(format!("frames {} to {} of {count}", frames.start, frames.end))
+            })?;
+        let mut arrays =
+            Arrays { channels: wanted.len(), largest: vec![0.0; wanted.len()], ..Arrays::default() };
         if form == Bricks::AsStored {
             arrays.shapes = asset.store().shape_words().to_vec();
-            arrays.codecs = asset.store().shape_codecs().iter().fold(0, |bits, codec| bits | codec_bit(*codec));
+            arrays.codecs =
+                asset.store().shape_codecs().iter().fold(0, |bits, codec| bits | codec_bit(*codec));
         }
         let mut gathered = Gathered::default();
         for frame in frames {
@@ -213,7 +216,9 @@ impl Arrays {
         gathered: &mut Gathered,
     ) -> Result<Option<Place>, GpuError> {
         let (Some([min, max]), Some(tree)) = (grid.active_box, grid.levels.first()) else { return Ok(None) };
-        let columns = grid.world_from_index.ok_or(GpuError::Unsupported { feature: "a transform that is not linear" })?;
+        let columns = grid
+            .world_from_index
+            .ok_or(GpuError::Unsupported { feature: "a transform that is not linear" })?;
         let world_from_source = DAffine3::from_cols_array(&columns);
         let offset = IVec3::from_array(grid.index_offset);
         let first_cell = self.trees.cells.len() as u32;
@@ -342,7 +347,8 @@ impl Arrays {
     /// Puts the origin of the shaders' world into the middle of what is there.
     fn settle(&mut self) {
         let corners = self.places.iter().flatten().flat_map(Place::world_corners);
-        let (sum, count) = corners.fold((DVec3::ZERO, 0.0), |(sum, count), corner| (sum + corner, count + 1.0));
+        let (sum, count) =
+            corners.fold((DVec3::ZERO, 0.0), |(sum, count), corner| (sum + corner, count + 1.0));
         let middle = sum / f64::max(count, 1.0);
         self.origin = if middle.is_finite() { middle } else { DVec3::ZERO };
     }
@@ -382,7 +388,8 @@ impl Arrays {
 
     /// All fields, frame by frame. One at least, since no buffer is empty.
     pub(crate) fn fields(&self) -> Vec<Field> {
-        let field = |place: &Option<Place>| place.as_ref().map_or_else(Field::default, |p| p.field(self.origin));
+        let field =
+            |place: &Option<Place>| place.as_ref().map_or_else(Field::default, |p| p.field(self.origin));
         let mut fields: Vec<Field> = self.places.iter().map(field).collect();
         if fields.is_empty() {
             fields.push(Field::default());
@@ -400,7 +407,8 @@ impl Arrays {
             bytemuck::cast_slice(entries),
             masks,
         ];
-        let mut words = Vec::with_capacity(HEADER_WORDS + arrays.iter().map(|array| array.len()).sum::<usize>());
+        let mut words =
+            Vec::with_capacity(HEADER_WORDS + arrays.iter().map(|array| array.len()).sum::<usize>());
         let mut at = HEADER_WORDS as u32;
         for array in arrays {
             words.push(at);

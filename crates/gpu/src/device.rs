@@ -119,7 +119,8 @@ impl Gpu {
     /// If the device is lost, runs out of memory, or refuses something.
     pub(crate) fn guarded<T>(&self, run: impl FnOnce() -> T) -> Result<T, GpuError> {
         self.health()?;
-        let filters = [wgpu::ErrorFilter::OutOfMemory, wgpu::ErrorFilter::Internal, wgpu::ErrorFilter::Validation];
+        let filters =
+            [wgpu::ErrorFilter::OutOfMemory, wgpu::ErrorFilter::Internal, wgpu::ErrorFilter::Validation];
         let scopes = filters.map(|filter| self.device.push_error_scope(filter));
         let result = run();
         let mut found = None;
@@ -155,7 +156,12 @@ impl Gpu {
     ///
     /// # Errors
     /// If the device has no memory left.
-    pub(crate) fn buffer(&self, label: &str, bytes: &[u8], usage: wgpu::BufferUsages) -> Result<wgpu::Buffer, GpuError> {
+    pub(crate) fn buffer(
+        &self,
+        label: &str,
+        bytes: &[u8],
+        usage: wgpu::BufferUsages,
+    ) -> Result<wgpu::Buffer, GpuError> {
         let buffer = self.empty_buffer(label, bytes.len() as u64, usage | wgpu::BufferUsages::COPY_DST)?;
         self.guarded(|| self.queue.write_buffer(&buffer, 0, bytes))?;
         Ok(buffer)
@@ -165,8 +171,14 @@ impl Gpu {
     ///
     /// # Errors
     /// If the device has no memory left.
-    pub(crate) fn empty_buffer(&self, label: &str, size: u64, usage: wgpu::BufferUsages) -> Result<wgpu::Buffer, GpuError> {
-        let descriptor = wgpu::BufferDescriptor { label: Some(label), size, usage, mapped_at_creation: false };
+    pub(crate) fn empty_buffer(
+        &self,
+        label: &str,
+        size: u64,
+        usage: wgpu::BufferUsages,
+    ) -> Result<wgpu::Buffer, GpuError> {
+        let descriptor =
+            wgpu::BufferDescriptor { label: Some(label), size, usage, mapped_at_creation: false };
         self.guarded(|| self.device.create_buffer(&descriptor))
     }
 

@@ -61,7 +61,8 @@ impl Renderer {
         }
         let usage = wgpu::BufferUsages::COPY_DST;
         let params_bytes = size_of::<Params>() as u64;
-        let params = gpu.empty_buffer("nuage parameters", params_bytes, usage | wgpu::BufferUsages::UNIFORM)?;
+        let params =
+            gpu.empty_buffer("nuage parameters", params_bytes, usage | wgpu::BufferUsages::UNIFORM)?;
         let usage = usage | wgpu::BufferUsages::COPY_SRC | wgpu::BufferUsages::STORAGE;
         let picture = gpu.empty_buffer("nuage picture", bytes, usage)?;
         let group = |stage, is_read| {
@@ -83,7 +84,8 @@ impl Renderer {
             },
             count: None,
         };
-        let descriptor = wgpu::BindGroupLayoutDescriptor { label: Some("nuage depth"), entries: &[depth_entry] };
+        let descriptor =
+            wgpu::BindGroupLayoutDescriptor { label: Some("nuage depth"), entries: &[depth_entry] };
         let depth_layout = gpu.guarded(|| gpu.device().create_bind_group_layout(&descriptor))?;
         Ok(Renderer {
             gpu: gpu.clone(),
@@ -376,7 +378,8 @@ impl Renderer {
     /// # Errors
     /// If nothing was prepared, or the device fails.
     pub fn run(&mut self, volume: &Volume) -> Result<(), GpuError> {
-        let mut encoder = self.gpu.device().create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
+        let mut encoder =
+            self.gpu.device().create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
         self.record(&mut encoder, volume)?;
         self.gpu.guarded(|| self.gpu.queue().submit([encoder.finish()]))?;
         self.gpu.wait()

@@ -209,12 +209,17 @@ fn hdda(body: &Body<'_>) -> String {
 fn brick_words(features: &Features) -> String {
     let mut text = String::new();
     for chunk in 0..features.chunks {
-        let _ = writeln!(text, "@group(0) @binding({}) var<storage, read> bricks_{chunk}: array<u32>;", 3 + chunk);
+        let _ = writeln!(
+            text,
+            "@group(0) @binding({}) var<storage, read> bricks_{chunk}: array<u32>;",
+            3 + chunk
+        );
     }
     text += "fn brick_word(at: u32) -> u32 {\n";
     if features.chunks > 1 {
         let shift = features.log2_chunk_words;
-        let _ = writeln!(text, "    let within = at & ((1u << {shift}u) - 1u);\n    switch (at >> {shift}u) {{");
+        let _ =
+            writeln!(text, "    let within = at & ((1u << {shift}u) - 1u);\n    switch (at >> {shift}u) {{");
         for chunk in 1..features.chunks {
             let _ = writeln!(text, "        case {chunk}u: {{ return bricks_{chunk}[within]; }}");
         }
@@ -330,7 +335,9 @@ fn prelude(features: &Features) -> String {
     p.u("NODE4_SUMMARY_WORDS", NODE4_SLOTS / 1024);
     p.u("NODE5_SUMMARY_WORDS", NODE5_SLOTS / 1024);
     p.u("CELL_WORDS", size_of::<RootCell>() / 4);
-    for (i, name) in ["CELLS", "NODE5S", "NODE4S", "ENTRIES", "MASKS", "SHAPES", "FIELDS_PER_FRAME"].iter().enumerate() {
+    for (i, name) in
+        ["CELLS", "NODE5S", "NODE4S", "ENTRIES", "MASKS", "SHAPES", "FIELDS_PER_FRAME"].iter().enumerate()
+    {
         p.u(name, i);
     }
     p.u("ABSENT_TAG", ABSENT_TAG);
@@ -356,7 +363,10 @@ fn prelude(features: &Features) -> String {
     p.u("SPARSE_BENT", sparse::BENT);
     p.u("SPARSE_HAS_ENDS", sparse::HAS_ENDS);
     p.f("SPARSE_LAST_END", sparse::LAST_END);
-    CODEC_KINDS.iter().enumerate().for_each(|(i, name)| p.b(&format!("HAS_{name}"), features.codecs >> i & 1 == 1));
+    CODEC_KINDS
+        .iter()
+        .enumerate()
+        .for_each(|(i, name)| p.b(&format!("HAS_{name}"), features.codecs >> i & 1 == 1));
     p.u("BC7_MODES", tables::BC7_MODES);
     p.u("BC7_WEIGHTS", tables::BC7_WEIGHTS);
     p.u("BC7_TWO_SUBSETS", tables::BC7_TWO_SUBSETS);
@@ -391,7 +401,9 @@ fn prelude(features: &Features) -> String {
     p.b("HAS_EMISSION", features.glow_channel.is_some());
     p.b("IS_GREY", features.is_grey);
     p.b("ENCODES_SRGB", features.encodes_srgb);
-    for (i, name) in ["VIEW_DENSITY", "VIEW_DEPTH", "VIEW_INDEX", "VIEW_FIRST_DENSITY", "VIEW_HITS"].iter().enumerate() {
+    for (i, name) in
+        ["VIEW_DENSITY", "VIEW_DEPTH", "VIEW_INDEX", "VIEW_FIRST_DENSITY", "VIEW_HITS"].iter().enumerate()
+    {
         p.u(name, i);
     }
     p.0
@@ -403,7 +415,8 @@ mod tests {
     use naga::valid::{Capabilities, ValidationFlags, Validator};
 
     fn validate(text: &str) {
-        let module = naga::front::wgsl::parse_str(text).unwrap_or_else(|error| panic!("{}", error.emit_to_string(text)));
+        let module = naga::front::wgsl::parse_str(text)
+            .unwrap_or_else(|error| panic!("{}", error.emit_to_string(text)));
         // With no capability beyond those of WebGPU.
         let mut validator = Validator::new(ValidationFlags::all(), Capabilities::empty());
         validator.validate(&module).unwrap_or_else(|error| panic!("{}", error.emit_to_string(text)));

@@ -83,7 +83,9 @@ fn small_functions_are_those_of_rust() {
     };
     let rows = vec![
         row(&|i| [0, 1, 2, 3].map(|dimension| f32::from_bits(bits(i, dimension)))),
-        row(&|i| [180.0 * random(1, i, 0) - 95.0, logarithmic(random(1, i, 1)), logarithmic(random(1, i, 2)), 7.0]),
+        row(&|i| {
+            [180.0 * random(1, i, 0) - 95.0, logarithmic(random(1, i, 1)), logarithmic(random(1, i, 2)), 7.0]
+        }),
         row(&|i| [20.0 * random(2, i, 0) - 10.0, 2.0 * random(2, i, 1), 7.0, 7.0]),
         row(&|i| [4.0 * random(3, i, 0) - 2.0, 7.0, 7.0, 7.0]),
         row(&|i| phase_of(i).lobes()),
@@ -152,7 +154,8 @@ fn sparse_words(codec: Codec, is_fitted: bool, seed: u32, line: u32) -> Vec<u32>
     let random = |i: u32| hash_pixel(seed, 13, i, 0);
     let most_bits = 1 + (random(0) % 7) as u8;
     let bits = std::array::from_fn(|i| most_bits - (random(1 + i as u32) % u32::from(most_bits)) as u8);
-    let ends = std::array::from_fn(|i| [(random(20 + i as u32) % 16) as u8, (random(40 + i as u32) % 16) as u8]);
+    let ends =
+        std::array::from_fn(|i| [(random(20 + i as u32) % 16) as u8, (random(40 + i as u32) % 16) as u8]);
     let coding = sparse::Coding {
         most_bits,
         bits: if seed % 3 == 0 { [most_bits; 8] } else { bits },
@@ -193,7 +196,8 @@ fn bricks_decode_as_in_rust() {
         .chain(blocks)
         .collect();
     // Shapes of two kinds, for the shared bricks.
-    let shape_codecs = [Codec::Uniform { bits: 5 }, Codec::Block { format: BlockFormat::Bc7, axis: PackingAxis::Y }];
+    let shape_codecs =
+        [Codec::Uniform { bits: 5 }, Codec::Block { format: BlockFormat::Bc7, axis: PackingAxis::Y }];
     let shapes = shape_codecs.map(|codec| words_of(codec, 99)).concat();
     let shape_at = [0, shape_codecs[0].word_count() as u32];
 
@@ -223,7 +227,11 @@ fn bricks_decode_as_in_rust() {
         let is_fitted = seed % 5 < 2;
         let brick = words_of(Codec::Sparse { is_fitted, pairs: 3 }, seed);
         let pairs = brick.len().div_ceil(2);
-        let Some(codec @ Codec::Sparse { .. }) = u8::try_from(pairs).ok().filter(|pairs| *pairs < 70).map(|pairs| Codec::Sparse { is_fitted, pairs }) else {
+        let Some(codec @ Codec::Sparse { .. }) = u8::try_from(pairs)
+            .ok()
+            .filter(|pairs| *pairs < 70)
+            .map(|pairs| Codec::Sparse { is_fitted, pairs })
+        else {
             continue;
         };
         bricks.push((codec, words.len() as u32));
@@ -256,7 +264,11 @@ fn bricks_decode_as_in_rust() {
             // Codes and half floats are exact; two operations on values of the unit's size follow, which may be fused.
             let bound = 4.0 * f32::EPSILON * (unit * 600.0).min(value.abs() + 64.0 * unit);
             let bound = if matches!(codec, Codec::F32 | Codec::F16) { 0.0 } else { bound };
-            assert!((found[0] - value).abs() <= bound, "{codec:?} at {voxel}: {} instead of {value}", found[0]);
+            assert!(
+                (found[0] - value).abs() <= bound,
+                "{codec:?} at {voxel}: {} instead of {value}",
+                found[0]
+            );
         }
     }
 }

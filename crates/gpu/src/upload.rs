@@ -81,7 +81,8 @@ impl Volume {
         for chunk in 0..chunks {
             let first = chunk * chunk_words;
             let words = chunk_words.min(count - first).max(1);
-            let buffer = gpu.empty_buffer("nuage bricks", 4 * words as u64, storage | wgpu::BufferUsages::COPY_DST)?;
+            let buffer =
+                gpu.empty_buffer("nuage bricks", 4 * words as u64, storage | wgpu::BufferUsages::COPY_DST)?;
             // What of bricks and of shapes falls into this buffer.
             for (words_before, part) in [(0, bricks), (bricks.len(), shapes)] {
                 let begin = first.max(words_before);

@@ -37,7 +37,11 @@ fn hold_views(name: &str, renderer: &mut Renderer, volume: &GpuVolume, channel: 
     let density = View::Density { extinction: scene.volumes[0].extinction[0] };
     for view in [density, View::Depth, View::Index, View::FirstDensity] {
         let reference = render_view(&field, view, &scene.camera, SIZE, &|_, _| ()).expect("a picture");
-        hold(&format!("{name} {view:?}"), &picture(renderer, volume, &look, &Pass::View(view), 0), &reference.pixels);
+        hold(
+            &format!("{name} {view:?}"),
+            &picture(renderer, volume, &look, &Pass::View(view), 0),
+            &reference.pixels,
+        );
     }
     let hits = picture(renderer, volume, &look, &Pass::Hits, 0);
     let mut reader = field.reader();
@@ -56,7 +60,10 @@ fn hold_views(name: &str, renderer: &mut Renderer, volume: &GpuVolume, channel: 
         same += u32::from(is_same);
         met += u32::from(expected.is_some());
     }
-    println!("{name}: first hits are the same in {same} of {} pixels, {met} of which meet one", WIDTH * HEIGHT);
+    println!(
+        "{name}: first hits are the same in {same} of {} pixels, {met} of which meet one",
+        WIDTH * HEIGHT
+    );
     assert!(f64::from(same) >= 0.995 * f64::from(WIDTH * HEIGHT) && met > 1000, "{name}: {same}, {met}");
 }
 
@@ -74,10 +81,15 @@ fn surfaces_are_those_of_the_cpu() {
     let Some(gpu) = gpu() else { return };
     let mut renderer = common::renderer(&gpu);
     // Grows inwards from 0 at a distance of 3 outside of a bumpy ball.
-    let ball = channel_of([IVec3::splat(-30), IVec3::splat(30)], glam::DAffine3::from_scale(glam::DVec3::splat(0.04)), &[], |voxel| {
-        let p = voxel.as_vec3();
-        (3.0 - (p.length() - 20.0 - 4.0 * common::noise(p / 8.0))).clamp(0.0, 6.0)
-    });
+    let ball = channel_of(
+        [IVec3::splat(-30), IVec3::splat(30)],
+        glam::DAffine3::from_scale(glam::DVec3::splat(0.04)),
+        &[],
+        |voxel| {
+            let p = voxel.as_vec3();
+            (3.0 - (p.length() - 20.0 - 4.0 * common::noise(p / 8.0))).clamp(0.0, 6.0)
+        },
+    );
     let volume = uploaded(&gpu, &[&ball]);
     let scene = lit(&ball);
     let look = Look::of_scene(&scene).expect("a look");
@@ -92,7 +104,8 @@ fn surfaces_are_those_of_the_cpu() {
         let pixel = DVec2::new(f64::from(i % WIDTH), f64::from(i / WIDTH)) + 0.5;
         let expected = first_hit(&field, &mut reader, &scene.camera.ray(pixel, WIDTH, HEIGHT), 3.0);
         // A tenth of a voxel is 0.004 here; a hundredth of that is asked for.
-        let is_same = expected.map_or(hit[0] < 0.0, |expected| (f64::from(hit[0]) - expected.distance).abs() < 4e-5);
+        let is_same =
+            expected.map_or(hit[0] < 0.0, |expected| (f64::from(hit[0]) - expected.distance).abs() < 4e-5);
         same += u32::from(is_same);
     }
     println!("surface: the distance is the same in {same} of {} pixels", WIDTH * HEIGHT);
@@ -125,7 +138,8 @@ fn what_glows_looks_as_on_the_cpu() {
     let heat = channel_of([IVec3::new(-10, -40, 20), IVec3::new(40, 0, 60)], common::bent(), &[], |voxel| {
         1500.0 * common::noise(voxel.as_vec3() / 11.0)
     });
-    let blackbody = Spectrum::Blackbody { kelvin_per_unit: 1.5, scale: 1.0, table: Box::new(Blackbody::new(1500.0)) };
+    let blackbody =
+        Spectrum::Blackbody { kelvin_per_unit: 1.5, scale: 1.0, table: Box::new(Blackbody::new(1500.0)) };
     let volume = uploaded(&gpu, &[&density, &heat]);
     for spectrum in [blackbody, Spectrum::Linear { rgb: [2e-3, 1e-3, 5e-4] }] {
         let mut scene = lit(&density);
@@ -159,7 +173,8 @@ fn packed_volumes_look_as_on_the_cpu() {
         let channel = common::unpacked(&asset, 0, "density");
         let scene = lit(&channel);
         let look = Look::of_scene(&scene).expect("a look");
-        let quality = Quality { step_voxels: 2.0, shadow_step_voxels: 4.0, sky_rays: 0, ..Quality::default() };
+        let quality =
+            Quality { step_voxels: 2.0, shadow_step_voxels: 4.0, sky_rays: 0, ..Quality::default() };
         let arrays = Arrays::of_asset(&asset, &wanted, 0..1, form).expect("arrays");
         let volume = GpuVolume::new(&gpu, &arrays).expect("a volume");
         let ours = picture(&mut renderer, &volume, &look, &Pass::March(quality), 0);

@@ -17,13 +17,19 @@ use nuage_render::progressive::{Plan, Watch, trace};
 use nuage_render::scene::{Emission, Phase, Scene, Spectrum};
 use nuage_testkit::blocks::Estimate;
 
-const WIDTH: u32 = 64;
-const HEIGHT: u32 = 40;
+const WIDTH: u32 = 48;
+const HEIGHT: u32 = 32;
 /// Paths for each pixel on the GPU come in so many batches, whose spread tells their standard error.
 const BATCHES: u32 = 8;
 
 /// Red, green, blue and opacity of all pixels on the GPU.
-fn of_gpu(gpu: &Gpu, volume: &GpuVolume, look: &Look, settings: PathSettings, samples: u32) -> [Vec<Estimate>; 4] {
+fn of_gpu(
+    gpu: &Gpu,
+    volume: &GpuVolume,
+    look: &Look,
+    settings: PathSettings,
+    samples: u32,
+) -> [Vec<Estimate>; 4] {
     let mut renderer = Renderer::new(gpu, [WIDTH, HEIGHT]).expect("a renderer");
     let mut batches: Vec<Vec<[f32; 4]>> = Vec::new();
     let mut before = vec![[0.0_f32; 4]; (WIDTH * HEIGHT) as usize];
@@ -33,7 +39,8 @@ fn of_gpu(gpu: &Gpu, volume: &GpuVolume, look: &Look, settings: PathSettings, sa
             renderer.run(volume).expect("a run");
         }
         let count = ((batch + 1) * samples) as f32;
-        let sums: Vec<[f32; 4]> = renderer.pixels().expect("pixels").iter().map(|p| p.map(|v| v * count)).collect();
+        let sums: Vec<[f32; 4]> =
+            renderer.pixels().expect("pixels").iter().map(|p| p.map(|v| v * count)).collect();
         let mean = |(now, before): (&[f32; 4], &[f32; 4])| {
             std::array::from_fn(|i| (now[i] - before[i]) / samples as f32)
         };
@@ -73,7 +80,8 @@ fn compare(name: &str, gpu: &Gpu, volume: &GpuVolume, scene: &Scene<'_>, setting
     let look = Look::of_scene(scene).expect("a look");
     let ours = of_gpu(gpu, volume, &look, settings, 8);
     let theirs = of_cpu(scene, settings, 64);
-    for (channel, (ours, theirs)) in ["red", "green", "blue", "opacity"].iter().zip(ours.iter().zip(&theirs)) {
+    for (channel, (ours, theirs)) in ["red", "green", "blue", "opacity"].iter().zip(ours.iter().zip(&theirs))
+    {
         hold(&format!("{name}, {channel}"), ours, theirs);
     }
 }
@@ -90,7 +98,8 @@ fn hold(name: &str, ours: &[Estimate], theirs: &[Estimate]) {
         };
         let count = pixels.len() as f64;
         let means = [ours, theirs].map(|picture| sum(&|pixel| pixel.mean, picture) / count);
-        let variance: f64 = [ours, theirs].map(|p| sum(&|pixel| pixel.variance, p)).iter().sum::<f64>() / count.powi(2);
+        let variance: f64 =
+            [ours, theirs].map(|p| sum(&|pixel| pixel.variance, p)).iter().sum::<f64>() / count.powi(2);
         (means, (means[0] - means[1]).abs() / (variance + floor.powi(2)).sqrt())
     };
     let all: Vec<usize> = (0..ours.len()).collect();

@@ -84,7 +84,9 @@ pub fn noise(p: Vec3) -> f32 {
     let f = f * f * (3.0 - 2.0 * f);
     let at = |d: IVec3| {
         let v = corner.as_ivec3() + d;
-        unit_f32(hash_u32((v.x as u32).wrapping_mul(7919) ^ (v.y as u32).wrapping_mul(104_729) ^ hash_u32(v.z as u32)))
+        unit_f32(hash_u32(
+            (v.x as u32).wrapping_mul(7919) ^ (v.y as u32).wrapping_mul(104_729) ^ hash_u32(v.z as u32),
+        ))
     };
     let mix = |a: f32, b: f32, t: f32| a + (b - a) * t;
     let line = |x, y| mix(at(IVec3::new(x, y, 0)), at(IVec3::new(x, y, 1)), f.z);
@@ -139,16 +141,22 @@ pub fn half_cloud() -> Channel {
 /// Bricks beside tiles of two sizes, whose borders blend.
 pub fn tiles() -> Channel {
     let tiles = [(IVec3::ZERO, TileSize::Node4), (IVec3::new(16, 2, 3), TileSize::Brick)];
-    channel_of([IVec3::splat(0), IVec3::new(170, 127, 127)], DAffine3::from_scale(DVec3::splat(0.02)), &tiles, |voxel| {
-        if voxel.x > 140 { 0.5 * noise(voxel.as_vec3() / 7.0) } else { 0.0 }
-    })
+    channel_of(
+        [IVec3::splat(0), IVec3::new(170, 127, 127)],
+        DAffine3::from_scale(DVec3::splat(0.02)),
+        &tiles,
+        |voxel| {
+            if voxel.x > 140 { 0.5 * noise(voxel.as_vec3() / 7.0) } else { 0.0 }
+        },
+    )
 }
 
 /// A camera that sees all of a channel from aside.
 pub fn camera_of(channel: &Channel) -> Camera {
     let world_box = nuage_render::framing::WorldBox::of(channel).expect("a place");
     let aspect = f64::from(SIZE[0]) / f64::from(SIZE[1]);
-    let camera = nuage_render::framing::fit_camera(world_box, DVec3::new(0.5, 0.35, 1.0), DVec3::Y, 35.0, aspect);
+    let camera =
+        nuage_render::framing::fit_camera(world_box, DVec3::new(0.5, 0.35, 1.0), DVec3::Y, 35.0, aspect);
     let mut camera = camera.expect("a view");
     // Half as wide: most of the picture shows something.
     camera.half_width_tangent *= 0.5;
@@ -230,7 +238,10 @@ pub fn hold(name: &str, ours: &[[f32; 4]], reference: &[[f32; 4]]) {
     let mean = errors.iter().sum::<f64>() / errors.len() as f64;
     let worst = errors.iter().copied().fold(0.0, f64::max);
     let seen = reference.iter().filter(|pixel| pixel[3] > 0.0).count();
-    println!("{name}: {:.3} % of pixels within 1/255, mean error {mean:.2e}, worst {worst:.2e}", 100.0 * good);
+    println!(
+        "{name}: {:.3} % of pixels within 1/255, mean error {mean:.2e}, worst {worst:.2e}",
+        100.0 * good
+    );
     assert!(seen > reference.len() / 20, "{name}: only {seen} pixels show anything");
     assert!(good >= 0.999 && mean < 1e-4, "{name}: {good} good, mean {mean}, worst {worst}");
 }
