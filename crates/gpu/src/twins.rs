@@ -122,7 +122,6 @@ fn small_functions_are_those_of_rust() {
         let value = phase.between(before, got_after);
         assert!((got[3] / value - 1.0).abs() < 2e-3, "{phase:?}: {} instead of {value}", got[3]);
     }
-    println!("worst of exp, 1 - exp, ln (last places), sin and cos, sRGB: {worst:?}");
     // Single operations may be fused on a device, which moves a last bit of each.
     assert!(worst[0] <= 4.0 && worst[1] <= 4.0 && worst[2] <= 8.0, "{worst:?}");
     assert!(worst[3] <= 1e-6 && worst[4] <= 1e-5, "{worst:?}");
@@ -158,8 +157,8 @@ fn sparse_words(codec: Codec, is_fitted: bool, seed: u32, line: u32) -> Vec<u32>
         std::array::from_fn(|i| [(random(20 + i as u32) % 16) as u8, (random(40 + i as u32) % 16) as u8]);
     let coding = sparse::Coding {
         most_bits,
-        bits: if seed % 3 == 0 { [most_bits; 8] } else { bits },
-        is_bent: seed % 2 == 0,
+        bits: if seed.is_multiple_of(3) { [most_bits; 8] } else { bits },
+        is_bent: seed.is_multiple_of(2),
         ends: (!is_fitted && seed % 4 < 2).then_some(ends),
     };
     let plane = random(60) % 20;

@@ -1,6 +1,8 @@
 //! The path tracer of the GPU held to that of the CPU: both are estimates, so blocks of pixels are compared in standard
 //! errors.
 
+#![allow(clippy::print_stdout, reason = "the measured errors are worth reading")]
+
 mod common;
 
 use common::{bent, channel_of, cloud, gpu, lit, uploaded};
