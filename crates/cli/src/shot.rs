@@ -454,7 +454,6 @@ impl Shot {
 
     /// As above; without the feature `gpu` there is no device to call it with.
     #[cfg(not(feature = "gpu"))]
-    #[expect(clippy::unused_self, reason = "it has the shape of its twin")]
     pub(crate) fn render_frame_on(
         &self,
         gpu: &Gpu,
