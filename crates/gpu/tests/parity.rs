@@ -173,8 +173,11 @@ fn packed_volumes_look_as_on_the_cpu() {
         let channel = common::unpacked(&asset, 0, "density");
         let scene = lit(&channel);
         let look = Look::of_scene(&scene).expect("a look");
+        // Bounds of BC4 bricks leave room for hardware decoders, so that runs begin a brick earlier and steps lie elsewhere
+        // at their ends: shorter steps make that small.
+        let step_voxels = if name == "BC4" { 0.5 } else { 2.0 };
         let quality =
-            Quality { step_voxels: 2.0, shadow_step_voxels: 4.0, sky_rays: 0, ..Quality::default() };
+            Quality { step_voxels, shadow_step_voxels: 2.0 * step_voxels, sky_rays: 0, ..Quality::default() };
         let arrays = Arrays::of_asset(&asset, &wanted, 0..1, form).expect("arrays");
         let volume = GpuVolume::new(&gpu, &arrays).expect("a volume");
         let ours = picture(&mut renderer, &volume, &look, &Pass::March(quality), 0);
