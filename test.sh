@@ -142,9 +142,9 @@ if component fmt rustfmt; then
     stage "formatting" cargo fmt --all --check
 fi
 if component clippy clippy; then
-    stage "lints" cargo clippy --quiet --workspace --all-targets -- -D warnings
+    stage "lints" cargo clippy --quiet --workspace --all-targets --features nuage/gpu -- -D warnings
 fi
-stage "tests" cargo test --quiet --workspace
+stage "tests" cargo test --quiet --workspace --features nuage/gpu
 stage "documentation" env RUSTDOCFLAGS="-D warnings" cargo doc --quiet --workspace --no-deps
 stage "tidy" cargo xtask tidy
 

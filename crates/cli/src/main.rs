@@ -7,6 +7,7 @@
 mod convert;
 mod demo;
 mod denoise;
+mod device;
 mod diff;
 mod error;
 mod eval;

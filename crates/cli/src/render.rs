@@ -17,6 +17,7 @@ use nuage_render::progressive::Stopped;
 use nuage_volume::channel::IndexBox;
 
 use crate::denoise;
+use crate::device::{self, Gpu};
 use crate::error::Failure;
 use crate::frames;
 use crate::look::{Filter, Integrator, Look, View};
@@ -93,6 +94,10 @@ pub(crate) struct Args {
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
     threads: Option<u16>,
 
+    /// What renders: cpu, gpu for the best graphics card, or a part of a card's name
+    #[arg(long, value_name = "DEVICE", default_value = "cpu")]
+    device: String,
+
     /// Print how long each part took, and the settled camera and scales
     #[arg(long)]
     timing: bool,
@@ -143,7 +148,9 @@ pub(crate) fn run(args: &Args, given: &Given) -> Result<(), Failure> {
     let Some(output) = run.output.as_deref() else {
         return Err(Failure::Usage("the scene names no picture to write: give --output".into()));
     };
-    let is_traced = plan.look.integrator == Integrator::Path;
+    let gpu = device::open(&args.device)?;
+    let is_traced = plan.look.integrator == Integrator::Path && gpu.is_none();
+    check_device(gpu.is_some(), &plan.look, &run).map_err(Failure::Usage)?;
     check(&plan.look, &run, Path::new(output)).map_err(Failure::Usage)?;
     let denoiser = if run.denoise { Some(denoise::find()?) } else { None };
     let frames = find_inputs(&plan, run.frames.as_ref())?;
@@ -192,7 +199,9 @@ pub(crate) fn run(args: &Args, given: &Given) -> Result<(), Failure> {
     for (i, job) in jobs.iter().enumerate() {
         bar.set_message(job.output.display().to_string());
         let show = |done, total| progress::show(&bar, i, done, total);
-        if let Err(failure) = render_frame(&run, &shot, job, loaded.take(), denoiser.as_deref(), &show) {
+        if let Err(failure) =
+            render_frame(&run, &shot, job, loaded.take(), denoiser.as_deref(), gpu.as_ref(), &show)
+        {
             if let Failure::Usage(_) = failure {
                 return Err(failure);
             }
@@ -252,6 +261,22 @@ fn check(look: &Look, run: &RunKeys, output: &Path) -> Result<(), String> {
         return Err("--aovs takes an .exr: a .png has no layers".into());
     }
     Ok(())
+}
+
+/// What only the processor does is not asked of a GPU.
+fn check_device(has_gpu: bool, look: &Look, run: &RunKeys) -> Result<(), String> {
+    let of_the_processor = [
+        ("--noise", look.noise.is_some()),
+        ("--time", look.time.is_some()),
+        ("--checkpoint", run.checkpoint),
+        ("--aovs", run.aovs),
+        ("--denoise", run.denoise),
+        ("--seed", look.seed != 0),
+    ];
+    match of_the_processor.iter().find(|(_, is_asked)| has_gpu && *is_asked) {
+        Some((name, _)) => Err(format!("{name} is for --device cpu")),
+        None => Ok(()),
+    }
 }
 
 /// The frames to be rendered, each with its number and the files of its volumes.
@@ -322,6 +347,7 @@ fn render_frame(
     job: &Job,
     loaded: Option<Vec<Option<Volume>>>,
     denoiser: Option<&Path>,
+    gpu: Option<&Gpu>,
     progress: &(dyn Fn(u32, u32) + Sync),
 ) -> Result<(), Failure> {
     let start = Instant::now();
@@ -338,13 +364,19 @@ fn render_frame(
     }
     let read = start.elapsed();
     let traced = match shot.plan().look.integrator {
-        Integrator::Path => Some(trace::render(run, shot, job, &volumes, denoiser, progress)?),
-        Integrator::March => None,
+        Integrator::Path if gpu.is_none() => {
+            Some(trace::render(run, shot, job, &volumes, denoiser, progress)?)
+        }
+        Integrator::Path | Integrator::March => None,
     };
     let bytes = match &traced {
         Some(traced) => Cow::Borrowed(&traced.bytes),
         None => {
-            let image = shot.render_frame(&volumes, progress).map_err(|e| Failure::Usage(e.to_string()))?;
+            let image = match gpu {
+                Some(gpu) => shot.render_frame_on(gpu, &volumes, progress),
+                None => shot.render_frame(&volumes, progress).map_err(|e| e.to_string()),
+            };
+            let image = image.map_err(Failure::Usage)?;
             Cow::Owned(encoder(&job.output, run.exr_float)?(&image).map_err(|e| plain(&job.output, e))?)
         }
     };

@@ -27,6 +27,7 @@ use nuage_render::views;
 use nuage_vdb::{File, Source};
 use nuage_volume::channel::Channel;
 
+use crate::device::Gpu;
 use crate::error::explain;
 use crate::look::{Integrator, Look, View};
 use crate::plan::{EmissionPlan, Extinction, Glow, LightPlan, PhasePlan, Plan, SkyPlan};
@@ -386,14 +387,7 @@ impl Shot {
         let [width, height] = self.size();
         let volume = scene.volumes.first();
         let field = volume.and_then(|volume| volume.shape.channel()).and_then(Field::new);
-        let extinction = volume.map_or(1.0, |volume| volume.extinction[0]);
-        let view = match view {
-            View::Density => views::View::Density { extinction },
-            View::Depth => views::View::Depth,
-            View::Index => views::View::Index,
-            View::FirstDensity => views::View::FirstDensity,
-            View::Surface => views::View::Surface { level: surface.unwrap_or(f32::INFINITY) },
-        };
+        let view = library_view(view, surface, scene);
         let image = match &field {
             Some(field) => views::render_view(field, view, &self.camera, [width, height], progress)?,
             // Nothing is seen of what is empty.
@@ -442,13 +436,10 @@ impl Shot {
         }
     }
 
-    fn render_scene(
-        &self,
-        scene: &Scene<'_>,
-        progress: &(dyn Fn(u32, u32) + Sync),
-    ) -> Result<Image, ImageSizeError> {
+    /// How finely pictures are marched.
+    fn quality(&self) -> Quality {
         let look = &self.plan.look;
-        let quality = Quality {
+        Quality {
             step_voxels: look.step,
             shadow_step_voxels: look.shadow_step,
             shadow_growth: look.shadow_growth,
@@ -457,7 +448,55 @@ impl Shot {
             sky_rays: look.sky_rays,
             samples: look.samples.unwrap_or(1),
             lookup: look.filter.lookup(),
+        }
+    }
+
+    /// Renders a frame on a GPU: composited, exposed.
+    ///
+    /// # Errors
+    /// What is wrong, in words.
+    #[cfg(feature = "gpu")]
+    pub(crate) fn render_frame_on(
+        &self,
+        gpu: &Gpu,
+        frame: &Frame<'_>,
+        progress: &dyn Fn(u32, u32),
+    ) -> Result<Image, String> {
+        use nuage_gpu::picture::{Asked, render};
+        let (scene, look) = (self.scene(frame), &self.plan.look);
+        let surface = frame.iter().copied().flatten().find_map(|volume| volume.surface);
+        let asked = match (look.view, look.integrator) {
+            (Some(view), _) => Asked::View(library_view(view, surface, &scene)),
+            (None, Integrator::March) => Asked::March(self.quality()),
+            (None, Integrator::Path) => {
+                let plan = self.paths();
+                Asked::Path { settings: plan.settings, samples: plan.samples }
+            }
         };
+        let image = render(gpu, &scene, &asked, self.size(), progress).map_err(|error| error.to_string())?;
+        let image = self.before(image, &scene);
+        // Views are not light.
+        Ok(if look.exposure == 0.0 || look.view.is_some() { image } else { image.exposed(look.exposure) })
+    }
+
+    /// As above; without the feature `gpu` there is no device to call it with.
+    #[cfg(not(feature = "gpu"))]
+    pub(crate) fn render_frame_on(
+        &self,
+        gpu: &Gpu,
+        _frame: &Frame<'_>,
+        _progress: &dyn Fn(u32, u32),
+    ) -> Result<Image, String> {
+        match *gpu {}
+    }
+
+    fn render_scene(
+        &self,
+        scene: &Scene<'_>,
+        progress: &(dyn Fn(u32, u32) + Sync),
+    ) -> Result<Image, ImageSizeError> {
+        let look = &self.plan.look;
+        let quality = self.quality();
         let Size { width, height } = look.size;
         let image = match look.integrator {
             Integrator::March => picture::render(scene, quality, width, height, progress)?,
@@ -471,6 +510,18 @@ impl Shot {
         };
         let image = self.before(image, scene);
         Ok(if look.exposure == 0.0 { image } else { image.exposed(look.exposure) })
+    }
+}
+
+/// A view as the library has it.
+fn library_view(view: View, surface: Option<f32>, scene: &Scene<'_>) -> views::View {
+    let extinction = scene.volumes.first().map_or(1.0, |volume| volume.extinction[0]);
+    match view {
+        View::Density => views::View::Density { extinction },
+        View::Depth => views::View::Depth,
+        View::Index => views::View::Index,
+        View::FirstDensity => views::View::FirstDensity,
+        View::Surface => views::View::Surface { level: surface.unwrap_or(f32::INFINITY) },
     }
 }
 

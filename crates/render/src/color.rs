@@ -13,11 +13,14 @@ pub fn luminance(rgb: [f32; 3]) -> f32 {
     0.2126 * rgb[0] + 0.7152 * rgb[1] + 0.0722 * rgb[2]
 }
 
+/// Up to here the curve of sRGB is straight.
+pub const SRGB_LINEAR_END: f32 = 0.003_130_8;
+
 /// The sRGB encoding of a linear component (IEC 61966-2-1). Does not clamp: negative values continue the
 /// straight part at the foot, values above 1 the curve.
 #[inline]
 pub fn linear_to_srgb(linear: f32) -> f32 {
-    if linear <= 0.003_130_8 { 12.92 * linear } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 }
+    if linear <= SRGB_LINEAR_END { 12.92 * linear } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 }
 }
 
 /// The linear component of an sRGB encoded one (IEC 61966-2-1): undoes [`linear_to_srgb`].
@@ -114,7 +117,8 @@ impl Blackbody {
     pub const COLDEST_KELVIN: f32 = 500.0;
     /// Above this temperature, in kelvin, the radiance stays what it is here.
     pub const HOTTEST_KELVIN: f32 = 50_000.0;
-    const STEPS: usize = 1024;
+    /// The steps of the table.
+    pub const STEPS: usize = 1024;
 
     /// The table in which `reference_kelvin` has luminance 1. A reference outside of
     /// [`COLDEST_KELVIN`](Self::COLDEST_KELVIN)..=[`HOTTEST_KELVIN`](Self::HOTTEST_KELVIN) counts as the
@@ -133,6 +137,12 @@ impl Blackbody {
             [rgb[0] / clamped, rgb[1] / clamped, rgb[2] / clamped, brightness]
         };
         Self { table: (0..=Self::STEPS).map(entry).collect() }
+    }
+
+    /// The table: colour of luminance 1, and the natural logarithm of the luminance, at equal steps of the reciprocal
+    /// temperature from the hottest to the coldest.
+    pub fn table(&self) -> &[[f32; 4]] {
+        &self.table
     }
 
     /// Radiance at a temperature as linear Rec.709, relative to the reference: Planck's law seen through the

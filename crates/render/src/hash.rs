@@ -5,6 +5,19 @@
 //! What is done with the numbers (directions, distances) lives with the thing that is sampled, such as
 //! [`phase`](crate::phase).
 
+/// What [`hash_u32`] multiplies by.
+pub const HASH_FACTORS: [u32; 2] = [0x21f0_aaad, 0xd35a_2d97];
+
+/// The golden ratio's bits.
+pub const GOLDEN: u32 = 0x9e37_79b9;
+
+/// What [`unit_f32`] counts in.
+pub const UNIT_STEP: f32 = 1.0 / 16_777_216.0;
+
+/// The additive recurrence of the plastic number, as steps of 32 bits (Roberts, "The Unreasonable Effectiveness of
+/// Quasirandom Sequences", 2018).
+pub const PLASTIC_STEPS: [u32; 2] = [0xc13f_a9a9, 0x91e1_0da5];
+
 /// A bijection of 32 bits that flips each output bit with a chance close to one half when any input bit
 /// flips.
 ///
@@ -12,8 +25,8 @@
 /// 0.107) with Wellons' hash-prospector (<https://github.com/skeeto/hash-prospector>). 0 maps to 0.
 #[inline]
 pub fn hash_u32(x: u32) -> u32 {
-    let x = (x ^ (x >> 16)).wrapping_mul(0x21f0_aaad);
-    let x = (x ^ (x >> 15)).wrapping_mul(0xd35a_2d97);
+    let x = (x ^ (x >> 16)).wrapping_mul(HASH_FACTORS[0]);
+    let x = (x ^ (x >> 15)).wrapping_mul(HASH_FACTORS[1]);
     x ^ (x >> 15)
 }
 
@@ -25,7 +38,7 @@ pub fn hash_u32(x: u32) -> u32 {
 #[inline]
 pub fn hash_pixel(x: u32, y: u32, sample: u32, dimension: u32) -> u32 {
     // The golden ratio's bits keep the corner pixel's first number away from the hash's fixed point at 0.
-    let pixel = hash_u32((x ^ y.rotate_left(16)).wrapping_add(0x9e37_79b9));
+    let pixel = hash_u32((x ^ y.rotate_left(16)).wrapping_add(GOLDEN));
     let path = hash_u32(pixel.wrapping_add(sample));
     hash_u32(path.wrapping_add(dimension))
 }
@@ -34,7 +47,7 @@ pub fn hash_pixel(x: u32, y: u32, sample: u32, dimension: u32) -> u32 {
 /// 1.
 #[inline]
 pub fn unit_f32(bits: u32) -> f32 {
-    (bits >> 8) as f32 * (1.0 / 16_777_216.0)
+    (bits >> 8) as f32 * UNIT_STEP
 }
 
 #[cfg(test)]

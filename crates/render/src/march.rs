@@ -28,22 +28,25 @@ use crate::blocks::Blocks;
 use crate::camera::Ray;
 use crate::depth;
 use crate::filter::{Filter, Lookup};
-use crate::hash::{hash_u32, unit_f32};
+use crate::hash::{PLASTIC_STEPS, hash_u32, unit_f32};
 use crate::light::{Light, Sky, Sun};
 use crate::math::{exp, one_minus_exp_neg};
 use crate::scene::{Phase, Scene, Shape, Spectrum, Volume};
 use crate::traverse::{Field, LocalRay, Reader, Run, RunKind, Runs, floor};
 
 /// A lit homogeneous run is cut after this optical depth, …
-const LIT_PIECE_DEPTH: f32 = 0.25;
+pub const LIT_PIECE_DEPTH: f32 = 0.25;
 /// … or after this many voxels, whichever is shorter.
-const LIT_PIECE_VOXELS: f32 = 8.0;
+pub const LIT_PIECE_VOXELS: f32 = 8.0;
 /// A group of steps that share a ray to the sun is no longer than this, …
-const GROUP_VOXELS: f32 = 8.0;
+pub const GROUP_VOXELS: f32 = 8.0;
 /// … unless it scatters less than this part of a full group; then …
-const FAINT_GROUP: f32 = 0.1;
+pub const FAINT_GROUP: f32 = 0.1;
 /// … this is its end.
-const FAINT_GROUP_VOXELS: f32 = 32.0;
+pub const FAINT_GROUP_VOXELS: f32 = 32.0;
+
+/// What tells the hash of the first ray to the sky, and of the directions of such rays, from others.
+pub const SKY_SEEDS: [u32; 2] = [0x5bd1_e995, 0x2545_f491];
 
 /// How finely a picture is computed.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -403,7 +406,7 @@ impl<'m, 's> Lighting<'m, 's> {
             group: Group::default(),
             group_lengths: [GROUP_VOXELS / voxels_per_length, FAINT_GROUP_VOXELS / voxels_per_length],
             sky: marcher.sky.map(|sky| sky * albedo).filter(|light| *light != Vec3::ZERO),
-            next_sky: unit_f32(hash_u32(random ^ 0x5bd1_e995)) / rays,
+            next_sky: unit_f32(hash_u32(random ^ SKY_SEEDS[0])) / rays,
             scattered: 0.0,
             sky_index: 0,
             random,
@@ -466,12 +469,11 @@ impl<'m, 's> Lighting<'m, 's> {
 
     /// The next direction towards the sky, drawn from the phase function.
     fn sky_direction(&mut self) -> Vec3 {
-        // The additive recurrence of the plastic number (Roberts, "The Unreasonable Effectiveness of
-        // Quasirandom Sequences", 2018), started anew for each camera ray.
+        // Started anew for each camera ray.
         let sequence =
             |start: u32, step: u32| unit_f32(start.wrapping_add(self.sky_index.wrapping_mul(step)));
-        let start = hash_u32(self.random ^ 0x2545_f491);
-        let u = [sequence(start, 0xc13f_a9a9), sequence(hash_u32(start), 0x91e1_0da5)];
+        let start = hash_u32(self.random ^ SKY_SEEDS[1]);
+        let u = [sequence(start, PLASTIC_STEPS[0]), sequence(hash_u32(start), PLASTIC_STEPS[1])];
         self.sky_index += 1;
         self.marcher.medium.phase.sample(self.ray.direction.as_vec3(), u).0
     }

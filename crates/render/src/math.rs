@@ -12,8 +12,23 @@
 const ROUND: f32 = 12_582_912.0;
 
 /// ln 2 in two parts. The first has few enough bits that its product with any exponent is exact.
-const LN_2_HIGH: f32 = 0.693_359_4;
-const LN_2_LOW: f32 = -2.121_944_4e-4;
+pub const LN_2_HIGH: f32 = 0.693_359_4;
+/// What the first part lacks.
+pub const LN_2_LOW: f32 = -2.121_944_4e-4;
+/// The polynomial of [`exp`]: (e^r − 1 − r) / r² by powers of r.
+pub const EXP_SERIES: [f32; 5] = [0.5, 0.166_665_76, 4.166_655_2e-2, 8.363_233e-3, 1.392_625e-3];
+/// Below this [`exp`] is 0.
+pub const EXP_LOWEST: f32 = -87.33;
+/// Above this [`exp`] is infinite.
+pub const EXP_HIGHEST: f32 = 88.722_83;
+/// Beyond this optical depth [`one_minus_exp_neg`] rounds to 1.
+pub const OPAQUE_DEPTH: f32 = 17.5;
+/// The bits of √½: mantissas of [`ln`] lie between it and √2.
+pub const ROOT_HALF: i32 = 0x3f35_04f3;
+/// The polynomials of [`sin_cos_turns`], from the highest power down; the last terms are τ and 1.
+pub const SIN_SERIES: [f32; 3] = [-75.399_025, 81.592_49, -41.341_663];
+/// As [`SIN_SERIES`].
+pub const COS_SERIES: [f32; 4] = [59.422_474, -85.448_79, 64.939_37, -19.739_208];
 
 /// e^x as 2^n · (1 + q) with |ln(1 + q)| <= ln(2) / 2: returns `q`, and n in the low nine bits of the second
 /// value.
@@ -27,8 +42,9 @@ fn reduce(x: f32) -> (f32, u32) {
     let r = (x - n * LN_2_HIGH) - n * LN_2_LOW;
     // In pairs rather than term by term: half the wait for one result after another.
     let rr = r * r;
-    let high = (4.166_655_2e-2 + 8.363_233e-3 * r) + rr * 1.392_625e-3;
-    let p = (0.5 + 0.166_665_76 * r) + rr * high;
+    let [a, b, c, d, e] = EXP_SERIES;
+    let high = (c + d * r) + rr * e;
+    let p = (a + b * r) + rr * high;
     (r + rr * p, shifted.to_bits())
 }
 
@@ -38,14 +54,12 @@ fn reduce(x: f32) -> (f32, u32) {
 /// largest float; NaN for NaN.
 #[inline]
 pub fn exp(x: f32) -> f32 {
-    const LOWEST: f32 = -87.33;
-    const HIGHEST: f32 = 88.722_83;
     let (q, n) = reduce(x);
     // Added to the exponent field rather than multiplied: 2^128 is no float, yet e^88.5 is.
     let scaled = f32::from_bits((1.0 + q).to_bits().wrapping_add(n << 23));
-    if x < LOWEST {
+    if x < EXP_LOWEST {
         0.0
-    } else if x > HIGHEST {
+    } else if x > EXP_HIGHEST {
         f32::INFINITY
     } else if x.is_nan() {
         x
@@ -60,14 +74,12 @@ pub fn exp(x: f32) -> f32 {
 /// The result lies in 0..=1. A negative `tau` counts as 0; NaN stays NaN.
 #[inline]
 pub fn one_minus_exp_neg(tau: f32) -> f32 {
-    // Beyond this the result rounds to 1.
-    const OPAQUE: f32 = 17.5;
     let (q, n) = reduce(-tau);
     let scale = f32::from_bits(1.0f32.to_bits().wrapping_add(n << 23));
     let value = (1.0 - scale) - scale * q;
     if tau <= 0.0 {
         0.0
-    } else if tau > OPAQUE {
+    } else if tau > OPAQUE_DEPTH {
         1.0
     } else if tau.is_nan() {
         tau
@@ -81,8 +93,6 @@ pub fn one_minus_exp_neg(tau: f32) -> f32 {
 /// With `x = 2^e m` and `m` about 1, `ln m` is twice the area tangent of `(m - 1) / (m + 1)`, of which five terms are enough.
 #[inline]
 pub fn ln(x: f32) -> f32 {
-    /// The bits of √½: mantissas lie between it and √2.
-    const ROOT_HALF: i32 = 0x3f35_04f3;
     let bits = x.to_bits() as i32 - ROOT_HALF;
     let exponent = (bits >> 23) as f32;
     let mantissa = f32::from_bits(((bits & 0x007f_ffff) + ROOT_HALF) as u32);
@@ -90,8 +100,7 @@ pub fn ln(x: f32) -> f32 {
     let s2 = s * s;
     let series = s2 * (1.0 / 3.0 + s2 * (1.0 / 5.0 + s2 * (1.0 / 7.0 + s2 * (1.0 / 9.0))));
     // ln 2 in two parts, of which the first times an exponent is exact.
-    let (high, low) = (355.0 / 512.0, -2.121_944_4e-4);
-    exponent * high + (2.0 * s + (2.0 * s * series + exponent * low))
+    exponent * LN_2_HIGH + (2.0 * s + (2.0 * s * series + exponent * LN_2_LOW))
 }
 
 /// Sine and cosine, in this order, of an angle given in `turns` (1 is a full circle). Absolute error below
@@ -103,14 +112,11 @@ pub fn sin_cos_turns(turns: f32) -> (f32, f32) {
     // Within an eighth of a turn, and exact: both operands are multiples of the last bit of `turns`.
     let x = turns - (shifted - ROUND) * 0.25;
     let y = x * x;
-    let s = -75.399_025;
-    let s = s * y + 81.592_49;
-    let s = s * y - 41.341_663;
+    let [s, s1, s2] = SIN_SERIES;
+    let s = (s * y + s1) * y + s2;
     let sin = x * (s * y + std::f32::consts::TAU);
-    let c = 59.422_474;
-    let c = c * y - 85.448_79;
-    let c = c * y + 64.939_37;
-    let c = c * y - 19.739_208;
+    let [c, c1, c2, c3] = COS_SERIES;
+    let c = ((c * y + c1) * y + c2) * y + c3;
     let cos = c * y + 1.0;
     let (sin, cos) = if quarter & 1 == 0 { (sin, cos) } else { (cos, -sin) };
     if quarter & 2 == 0 { (sin, cos) } else { (-sin, -cos) }

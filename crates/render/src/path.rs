@@ -66,10 +66,10 @@ impl Default for PathSettings {
 }
 
 /// A path whose weight is less than this goes on with a chance of its weight over it.
-const ROULETTE_WEIGHT: f32 = 0.25;
+pub const ROULETTE_WEIGHT: f32 = 0.25;
 
 /// A shadow ray through which less passes goes on with a chance of that over it.
-const ROULETTE_TRANSMITTANCE: f32 = 0.1;
+pub const ROULETTE_TRANSMITTANCE: f32 = 0.1;
 
 /// Of collisions that are in the shade of a sun, so many follow a shadow ray at least. What one finds that the shade did not
 /// know of counts for as many as there are to each of them, so fewer would make bright specks.
@@ -84,7 +84,7 @@ const SHADE_HALVES: f32 = 0.5;
 const LATER_LOBES: [f32; 3] = [1.2, 0.72, 0.43];
 
 /// An extinction per world length through which nothing passes.
-const OPAQUE: f32 = 1e30;
+pub const OPAQUE: f32 = 1e30;
 
 /// A scene made ready for paths.
 pub struct PathTracer<'s> {

@@ -8,7 +8,7 @@
 mod draine;
 mod mie;
 
-pub use draine::MAX_ALPHA;
+pub use draine::{MAX_ALPHA, MAX_STEPS, TOLERANCE};
 pub use mie::Mie;
 
 use crate::math::sin_cos_turns;
@@ -82,6 +82,16 @@ impl Phase {
             Phase::HenyeyGreenstein { g } => g.clamp(-MAX_ASYMMETRY, MAX_ASYMMETRY),
             Phase::Draine { g, alpha } => draine::mean_cosine(g, alpha),
             Phase::Mie(mie) => mie.mean_cosine(),
+        }
+    }
+
+    /// The same as a Henyey–Greenstein lobe and one of Draine's: the first one's asymmetry, the second one's, its weight
+    /// of cos², and its share.
+    pub fn lobes(&self) -> [f32; 4] {
+        match *self {
+            Phase::HenyeyGreenstein { g } => [g, 0.0, 0.0, 0.0],
+            Phase::Draine { g, alpha } => [0.0, g, alpha, 1.0],
+            Phase::Mie(mie) => mie.lobes(),
         }
     }
 

@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use glam::DVec2;
 
 use crate::film::{Image, ImageSizeError, Tiling};
-use crate::hash::{hash_pixel, unit_f32};
+use crate::hash::{PLASTIC_STEPS, hash_pixel, unit_f32};
 use crate::march::{Marcher, Quality, Worker};
 use crate::packet::{RAYS, SIDE, square};
 use crate::scene::Scene;
@@ -118,5 +118,5 @@ fn pixel_offset(x: u32, y: u32, sample: u32, samples: u32) -> DVec2 {
         let start = hash_pixel(x, y, 0, dimension);
         f64::from(unit_f32(start.wrapping_add(sample.wrapping_mul(step))))
     };
-    DVec2::new(spread(0, 0xc13f_a9a9), spread(1, 0x91e1_0da5))
+    DVec2::new(spread(0, PLASTIC_STEPS[0]), spread(1, PLASTIC_STEPS[1]))
 }

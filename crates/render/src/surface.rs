@@ -95,7 +95,7 @@ pub fn first_voxel<'a>(
 }
 
 /// Halvings and chords until a root is as good as single precision makes it.
-const MOST_REFINEMENTS: usize = 16;
+pub const MOST_REFINEMENTS: usize = 16;
 
 #[inline(always)]
 fn meet_surface<'a, S: Simd>(

@@ -301,7 +301,7 @@ impl<'a> Field<'a> {
             t_brick: (8.0 * ray.inverse).abs(),
             sign: IVec3::select(forward, IVec3::ONE, IVec3::NEG_ONE),
             brick_end: IVec3::select(forward, self.brick_box[1] + 1, self.brick_box[0] - 1),
-            root_leaps_left: 4096,
+            root_leaps_left: MAX_ROOT_LEAPS,
             is_wide: self.is_wide,
             waiting: [Run { t0, t1, kind: RunKind::Varying }; 3],
             waiting_count: 0,
@@ -363,8 +363,11 @@ pub(crate) fn floor(x: f32) -> i32 {
     i.saturating_sub(i32::from(x < i as f32))
 }
 
+/// How often a ray may leap over cells that have no entry.
+pub const MAX_ROOT_LEAPS: u32 = 4096;
+
 /// Root tables up to this size are searched for the next cell; through larger ones a ray goes cell by cell.
-const MAX_ROOT_LEAP: usize = 512;
+pub const MAX_ROOT_LEAP: usize = 512;
 
 /// The iterator of [`Field::runs`].
 #[derive(Debug)]

@@ -1,7 +1,7 @@
 //! Simple views of a field, for whoever looks for a mistake: accumulated density, depth of the first voxel, its index and
 //! its density, and the surface of a level set. They need no light and no settings, and what they show is exact.
 
-use glam::DVec2;
+use glam::{DVec2, DVec3};
 
 use crate::camera::{Camera, Ray};
 use crate::film::{Image, ImageSizeError};
@@ -48,18 +48,12 @@ pub struct Viewer<'f, 'a> {
 impl<'f, 'a> Viewer<'f, 'a> {
     /// Makes a view ready.
     pub fn new(field: &'f Field<'a>, view: View, camera: &Camera) -> Self {
-        let corners = field.world_corners().map(|corner| (corner - camera.origin).length());
-        let furthest = corners.into_iter().fold(0.0, f64::max);
-        let centre = field.world_corners().into_iter().sum::<glam::DVec3>() / 8.0;
-        let radius = field.world_corners().map(|corner| (corner - centre).length());
-        let radius = radius.into_iter().fold(0.0, f64::max);
-        let nearest = ((centre - camera.origin).length() - radius).max(0.0);
         let surface = match view {
             View::Surface { level } => Some(Surface::new(field, level)),
             _ => None,
         };
-        let largest = field.tree().bounds().max;
-        Viewer { field, view, distances: [nearest, furthest], largest, surface }
+        let distances = distances(&field.world_corners(), camera);
+        Viewer { field, view, distances, largest: field.tree().bounds().max, surface }
     }
 
     /// Colours and opacities, linear light, colours times opacity.
@@ -95,7 +89,7 @@ impl<'f, 'a> Viewer<'f, 'a> {
             View::Index => {
                 let [first, size] = self.field.voxel_box();
                 // In doubles: 4096³ is beyond what single precision counts.
-                let local = (hit.voxel.as_dvec3() - first).max(glam::DVec3::ZERO);
+                let local = (hit.voxel.as_dvec3() - first).max(DVec3::ZERO);
                 let side = size.max_element();
                 let index = local.x + side * (local.y + side * local.z);
                 hue((index / (side * side * side)) as f32)
@@ -104,6 +98,14 @@ impl<'f, 'a> Viewer<'f, 'a> {
             View::FirstDensity => hue(hit.value / self.largest * (5.0 / 6.0)),
         }
     }
+}
+
+/// The nearest and the furthest distance from a camera that something between these corners can have.
+pub fn distances(corners: &[DVec3; 8], camera: &Camera) -> [f64; 2] {
+    let furthest_from = |p: DVec3| corners.iter().map(|corner| (*corner - p).length()).fold(0.0, f64::max);
+    let centre = corners.iter().sum::<DVec3>() / 8.0;
+    let nearest = ((centre - camera.origin).length() - furthest_from(centre)).max(0.0);
+    [nearest, furthest_from(camera.origin)]
 }
 
 /// The full colour of a hue, where 0 and 1 are red, a third green and two thirds blue.

@@ -8,10 +8,10 @@ use super::{Angle, MAX_ASYMMETRY, hg_at, sample_hg_angle};
 pub const MAX_ALPHA: f32 = 1000.0;
 
 /// A distribution is inverted to this share of the whole, a few steps of a number in 0..=1.
-const TOLERANCE: f32 = 4e-7;
+pub const TOLERANCE: f32 = 4e-7;
 
 /// Only a limit: three or four steps are usual.
-const MAX_STEPS: u32 = 40;
+pub const MAX_STEPS: u32 = 40;
 
 #[inline]
 fn limited(g: f32, alpha: f32) -> (f32, f32) {

@@ -46,6 +46,10 @@ impl Mie {
         self.diameter_um
     }
 
+    pub(super) fn lobes(&self) -> [f32; 4] {
+        [self.spike_g, self.body_g, self.body_alpha, self.body_weight]
+    }
+
     #[inline]
     pub(super) fn at(&self, angle: Angle) -> f32 {
         let body = draine::at(angle, self.body_g, self.body_alpha);

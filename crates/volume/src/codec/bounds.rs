@@ -6,10 +6,11 @@
 use crate::brick::Bounds;
 
 /// The mantissa bits of a float that a bound does not keep.
-const DROPPED_BITS: u32 = 23 - 6;
+pub const DROPPED_BITS: u32 = 23 - 6;
 /// What the exponent of a float is more than that of a bound.
-const EXPONENT_OFFSET: u32 = (127 - 31) << 6;
-const SIGN: u32 = 1 << 11;
+pub const EXPONENT_OFFSET: u32 = (127 - 31) << 6;
+/// The bit of a bound's sign; magnitudes are less.
+pub const SIGN: u32 = 1 << 11;
 
 /// The magnitude of a bound, not less than the one given, or not more.
 fn magnitude(value: f32, up: bool) -> u32 {

@@ -81,9 +81,11 @@ pub enum Codec {
 const FORMATS: [BlockFormat; 3] = [BlockFormat::Bc4, BlockFormat::Bc3, BlockFormat::Bc7];
 const AXES: [PackingAxis; 3] = [PackingAxis::X, PackingAxis::Y, PackingAxis::Z];
 
-/// The first tags of [`Codec::Sparse`], and the first beyond.
-const SPARSE_TAG: u8 = 56;
-const SPARSE_FITTED_TAG: u8 = SPARSE_TAG + 70;
+/// The first tag of [`Codec::Sparse`].
+pub const SPARSE_TAG: u8 = 56;
+/// The first of those that are fitted.
+pub const SPARSE_FITTED_TAG: u8 = SPARSE_TAG + 70;
+/// The first tag beyond.
 const SPARSE_END_TAG: u8 = SPARSE_FITTED_TAG + 70;
 
 impl Codec {

@@ -115,7 +115,7 @@ impl Coding {
 }
 
 /// What is added to the bits of codes in their word if they are bent.
-const BENT: u32 = 8;
+pub const BENT: u32 = 8;
 /// What is added if each octant has ends of its own.
 pub const HAS_ENDS: u32 = 16;
 /// The words of all ends.

@@ -5,19 +5,27 @@
 //! between them. The tables are those of the Khronos Data Format Specification 1.3, section "BPTC".
 
 /// How a mode shares out its bits; all fields but the first count bits.
-struct Mode {
-    subsets: usize,
-    partition: u32,
-    rotation: u32,
-    selection: u32,
-    colour: u32,
-    alpha: u32,
+pub struct Mode {
+    /// How many subsets there are.
+    pub subsets: usize,
+    /// The number of the partition.
+    pub partition: u32,
+    /// Which channel changes places with alpha.
+    pub rotation: u32,
+    /// Which indices are the colours'.
+    pub selection: u32,
+    /// Each colour of an endpoint.
+    pub colour: u32,
+    /// The alpha of an endpoint.
+    pub alpha: u32,
     /// Of each endpoint, below its channels.
-    endpoint_low: u32,
+    pub endpoint_low: u32,
     /// Of each subset, below the channels of both its endpoints.
-    shared_low: u32,
-    index: u32,
-    second_index: u32,
+    pub shared_low: u32,
+    /// Each index.
+    pub index: u32,
+    /// Each second index.
+    pub second_index: u32,
 }
 
 impl Mode {
@@ -36,7 +44,8 @@ impl Mode {
     }
 }
 
-const MODES: [Mode; 8] = [
+/// The modes of blocks.
+pub const MODES: [Mode; 8] = [
     Mode::of([3, 4, 0, 0, 4, 0, 1, 0, 3, 0]),
     Mode::of([2, 6, 0, 0, 6, 0, 0, 1, 3, 0]),
     Mode::of([3, 6, 0, 0, 5, 0, 0, 0, 2, 0]),
@@ -48,13 +57,15 @@ const MODES: [Mode; 8] = [
 ];
 
 /// How far the texels of each index lie on the way between the endpoints, in 64ths.
-const WEIGHTS_2: [u8; 4] = [0, 21, 43, 64];
-const WEIGHTS_3: [u8; 8] = [0, 9, 18, 27, 37, 46, 55, 64];
-const WEIGHTS_4: [u8; 16] = [0, 4, 9, 13, 17, 21, 26, 30, 34, 38, 43, 47, 51, 55, 60, 64];
+pub const WEIGHTS_2: [u8; 4] = [0, 21, 43, 64];
+/// The same for indices of three bits.
+pub const WEIGHTS_3: [u8; 8] = [0, 9, 18, 27, 37, 46, 55, 64];
+/// The same for indices of four bits.
+pub const WEIGHTS_4: [u8; 16] = [0, 4, 9, 13, 17, 21, 26, 30, 34, 38, 43, 47, 51, 55, 60, 64];
 
 /// The partitions into two subsets: bit `i` is the subset of texel `i`.
 #[rustfmt::skip]
-const TWO_SUBSETS: [u16; 64] = [
+pub const TWO_SUBSETS: [u16; 64] = [
     0xcccc, 0x8888, 0xeeee, 0xecc8, 0xc880, 0xfeec, 0xfec8, 0xec80,
     0xc800, 0xffec, 0xfe80, 0xe800, 0xffe8, 0xff00, 0xfff0, 0xf000,
     0xf710, 0x008e, 0x7100, 0x08ce, 0x008c, 0x7310, 0x3100, 0x8cce,
@@ -67,7 +78,7 @@ const TWO_SUBSETS: [u16; 64] = [
 
 /// The partitions into three subsets: bits `2i` and `2i + 1` are the subset of texel `i`.
 #[rustfmt::skip]
-const THREE_SUBSETS: [u32; 64] = [
+pub const THREE_SUBSETS: [u32; 64] = [
     0xaa68_5050, 0x6a5a_5040, 0x5a5a_4200, 0x5450_a0a8, 0xa5a5_0000, 0xa0a0_5050, 0x5555_a0a0, 0x5a5a_5050,
     0xaa55_0000, 0xaa55_5500, 0xaaaa_5500, 0x9090_9090, 0x9494_9494, 0xa4a4_a4a4, 0xa9a5_9450, 0x2a0a_4250,
     0xa594_5040, 0x0a42_5054, 0xa5a5_a500, 0x55a0_a0a0, 0xa8a8_5454, 0x6a6a_4040, 0xa4a4_5000, 0x1a1a_0500,
@@ -80,7 +91,7 @@ const THREE_SUBSETS: [u32; 64] = [
 
 /// The texel of the second of two subsets whose index has one bit less.
 #[rustfmt::skip]
-const TWO_ANCHOR: [u8; 64] = [
+pub const TWO_ANCHOR: [u8; 64] = [
     15, 15, 15, 15, 15, 15, 15, 15, 15, 15, 15, 15, 15, 15, 15, 15,
     15, 2, 8, 2, 2, 8, 8, 15, 2, 8, 2, 2, 8, 8, 2, 2,
     15, 15, 6, 8, 2, 8, 15, 15, 2, 8, 2, 2, 2, 15, 15, 6,
@@ -89,7 +100,7 @@ const TWO_ANCHOR: [u8; 64] = [
 
 /// The same for the second of three subsets.
 #[rustfmt::skip]
-const THREE_SECOND_ANCHOR: [u8; 64] = [
+pub const THREE_SECOND_ANCHOR: [u8; 64] = [
     3, 3, 15, 15, 8, 3, 15, 15, 8, 8, 6, 6, 6, 5, 3, 3,
     3, 3, 8, 15, 3, 3, 6, 10, 5, 8, 8, 6, 8, 5, 15, 15,
     8, 15, 3, 5, 6, 10, 8, 15, 15, 3, 15, 5, 15, 15, 15, 15,
@@ -98,7 +109,7 @@ const THREE_SECOND_ANCHOR: [u8; 64] = [
 
 /// The same for the third of three subsets.
 #[rustfmt::skip]
-const THREE_THIRD_ANCHOR: [u8; 64] = [
+pub const THREE_THIRD_ANCHOR: [u8; 64] = [
     15, 8, 8, 3, 15, 15, 3, 8, 15, 15, 15, 15, 15, 15, 15, 8,
     15, 8, 15, 3, 15, 8, 15, 8, 3, 15, 6, 10, 15, 15, 10, 8,
     15, 3, 15, 10, 10, 8, 9, 10, 6, 15, 8, 15, 3, 6, 6, 8,

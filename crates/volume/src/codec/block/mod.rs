@@ -15,7 +15,7 @@
 
 mod bc3;
 pub mod bc4;
-mod bc7;
+pub mod bc7;
 
 use crate::space::BRICK_VOXELS;
 

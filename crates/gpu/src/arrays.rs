@@ -1,0 +1,496 @@
+//! The words of a volume as shaders read them: trees, bricks and shapes of some frames, gathered from a packed volume or
+//! from channels in memory.
+//!
+//! Bricks stay as they are stored, whatever their codec: the shader decodes them. [`Bricks::Decoded`] trades memory for
+//! speed: 2 KiB for each brick, and the same values. Only what the frames asked for hold is taken; nodes and bricks that
+//! frames share are taken once.
+//!
+//! What does not live here: buffers ([`crate::upload`]), files, and the meaning of grids as media.
+
+use std::collections::HashMap;
+use std::ops::Range;
+
+use glam::{DAffine3, DVec3, IVec3};
+use nuage_volume::brick;
+use nuage_volume::channel::{Channel, IndexBox};
+use nuage_volume::codec::Codec;
+use nuage_volume::format::Asset;
+use nuage_volume::format::contents::{ChannelInfo, FrameGrid};
+use nuage_volume::packed::build::{EntryScale, Packer};
+use nuage_volume::packed::{Content, Entry, Node, RootCell, TreeRef, Trees, mask};
+use nuage_volume::space::{BRICK_VOXELS, NODE4_SLOTS, NODE5_SLOTS};
+
+use crate::error::GpuError;
+use crate::params::{Field, Place};
+use crate::shader::{HEADER_WORDS, codec_bit};
+
+/// In which form bricks are kept on the device.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Bricks {
+    /// As they are stored: the least memory.
+    AsStored,
+    /// As floats, 2 KiB each: the least work for each sample, and the same values.
+    Decoded,
+}
+
+/// What the values of a stored channel mean to the renderer, which wants values that are not negative, and 0 outside.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Meaning {
+    /// Themselves; what is negative counts as 0.
+    Density,
+    /// Signed distances, as fog that is full at a depth of `band` world lengths.
+    Fog {
+        /// The depth.
+        band: f32,
+    },
+    /// Signed distances, as what grows inwards from 0 at `band` outside to twice that: the surface is where it is `band`.
+    Surface {
+        /// The width of the band.
+        band: f32,
+    },
+}
+
+impl Meaning {
+    /// Scale, bias, and the largest value.
+    fn line(self) -> [f32; 3] {
+        match self {
+            Meaning::Density => [1.0, 0.0, f32::MAX],
+            Meaning::Fog { band } => [-1.0 / band, 0.0, 1.0],
+            Meaning::Surface { band } => [-1.0, band, 2.0 * band],
+        }
+    }
+}
+
+/// A channel of a packed volume that is wanted.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Wanted {
+    /// The name of its grid.
+    pub name: String,
+    /// What its values mean.
+    pub meaning: Meaning,
+}
+
+/// The words of a volume, and where each channel is in each frame.
+#[derive(Debug, Clone, Default)]
+pub struct Arrays {
+    trees: Trees,
+    words: Vec<u32>,
+    shapes: Vec<u32>,
+    /// Frame by frame, as many as there are channels; those that are nowhere are `None`.
+    places: Vec<Option<Place>>,
+    largest: Vec<f32>,
+    channels: usize,
+    codecs: u32,
+    origin: DVec3,
+}
+
+/// What is in which place already.
+#[derive(Default)]
+struct Gathered {
+    masks: HashMap<u32, u32>,
+    node5s: HashMap<(usize, u32), u32>,
+    node4s: HashMap<(usize, u32), u32>,
+    bricks: HashMap<(usize, u32), u32>,
+}
+
+impl Arrays {
+    /// The words of channels in memory: one frame, whose channels are numbered as they are given.
+    ///
+    /// # Errors
+    /// If they are too large to be indexed.
+    pub fn of_channels(channels: &[&Channel]) -> Result<Arrays, GpuError> {
+        let too_large = |_| GpuError::Misuse("a volume of more than 2³² words".to_owned());
+        let mut arrays = Arrays { channels: channels.len(), ..Arrays::default() };
+        let mut packer = Packer::default();
+        for channel in channels {
+            let bounds = channel.tree.bounds();
+            let unit = power_of_two_above(bounds.max.max(-bounds.min));
+            let (codec, codec_words) = match &channel.tree.bricks {
+                brick::Bricks::F32(_) => (Codec::F32, BRICK_VOXELS),
+                brick::Bricks::F16(_) => (Codec::F16, BRICK_VOXELS / 2),
+            };
+            let first = arrays.words.len();
+            match &channel.tree.bricks {
+                brick::Bricks::F32(values) => arrays.words.extend(values.iter().map(|value| value.to_bits())),
+                brick::Bricks::F16(values) => {
+                    let pairs = values.as_chunks::<2>().0.iter();
+                    arrays.words.extend(pairs.map(|[low, high]| u32::from(*low) | u32::from(*high) << 16));
+                }
+            }
+            let end = u32::try_from(arrays.words.len()).map_err(too_large)?;
+            let bricks: Vec<(Codec, u32)> =
+                (first as u32..end).step_by(codec_words).map(|offset| (codec, offset)).collect();
+            arrays.codecs |= if bricks.is_empty() { 0 } else { codec_bit(codec) };
+            let scale = EntryScale { unit, background: 0.0 };
+            let tree = packer.add(&channel.tree, &bricks, scale, |value| value);
+            let tree = tree.map_err(|error| GpuError::Misuse(error.to_string()))?;
+            arrays.places.push(channel.active_box.map(|active_box| Place {
+                world_from_index: channel.world_from_index,
+                active_box,
+                index_offset: IVec3::ZERO,
+                cells: [tree.first_cell, tree.cell_count],
+                brick_unit: 1.0,
+                bounds_unit: unit,
+                floor: f32::MIN,
+                meaning: Meaning::Density.line(),
+            }));
+            arrays.largest.push(bounds.max);
+        }
+        arrays.trees = packer.finish();
+        arrays.settle();
+        Ok(arrays)
+    }
+
+    /// The words of some frames of a packed volume, whose pages are loaded. Channels are numbered as they are wanted; one
+    /// that a frame lacks is empty there.
+    ///
+    /// # Errors
+    /// If there are no such frames, pages are not loaded, bricks are damaged, or a transform is not linear.
+    pub fn of_asset(
+        asset: &Asset,
+        wanted: &[Wanted],
+        frames: Range<usize>,
+        form: Bricks,
+    ) -> Result<Arrays, GpuError> {
+        let contents = asset.contents();
+        let frames =
+            contents.frames.get(frames.clone()).filter(|frames| !frames.is_empty()).ok_or_else(|| {
+                let count = contents.frames.len();
+                GpuError::Misuse(format!("frames {} to {} of {count}", frames.start, frames.end))
+            })?;
+        let mut arrays =
+            Arrays { channels: wanted.len(), largest: vec![0.0; wanted.len()], ..Arrays::default() };
+        if form == Bricks::AsStored {
+            arrays.shapes = asset.store().shape_words().to_vec();
+            arrays.codecs =
+                asset.store().shape_codecs().iter().fold(0, |bits, codec| bits | codec_bit(*codec));
+        }
+        let mut gathered = Gathered::default();
+        for frame in frames {
+            for (wanted, largest) in wanted.iter().zip(0..) {
+                let is_wanted = |grid: &&FrameGrid| {
+                    contents.channels.get(grid.channel as usize).is_some_and(|info| info.name == wanted.name)
+                };
+                let Some(grid) = frame.grids.iter().find(is_wanted) else {
+                    arrays.places.push(None);
+                    continue;
+                };
+                let channel = grid.channel as usize;
+                let info = &contents.channels[channel];
+                let [scale, bias, most] = wanted.meaning.line();
+                let peak = (bias + scale * info.peak).max(bias + scale * info.floor).clamp(0.0, most);
+                arrays.largest[largest] = arrays.largest[largest].max(peak);
+                let place = arrays.gather(asset, channel, grid, form, wanted.meaning, &mut gathered)?;
+                arrays.places.push(place);
+            }
+        }
+        arrays.settle();
+        Ok(arrays)
+    }
+
+    /// Bricks and shapes that no tree holds, for tests of their decoders.
+    #[cfg(test)]
+    pub(crate) fn of_words(words: Vec<u32>, shapes: Vec<u32>, unit: f32, floor: f32) -> Arrays {
+        let place = Place {
+            world_from_index: DAffine3::IDENTITY,
+            active_box: IndexBox { min: IVec3::ZERO, max: IVec3::ZERO },
+            index_offset: IVec3::ZERO,
+            cells: [0, 0],
+            brick_unit: unit,
+            bounds_unit: unit,
+            floor,
+            meaning: Meaning::Density.line(),
+        };
+        let (places, largest) = (vec![Some(place)], vec![unit]);
+        Arrays { words, shapes, places, largest, channels: 1, codecs: u32::MAX, ..Arrays::default() }
+    }
+
+    /// Takes the finest tree of a grid.
+    fn gather(
+        &mut self,
+        asset: &Asset,
+        channel: usize,
+        grid: &FrameGrid,
+        form: Bricks,
+        meaning: Meaning,
+        gathered: &mut Gathered,
+    ) -> Result<Option<Place>, GpuError> {
+        let (Some([min, max]), Some(tree)) = (grid.active_box, grid.levels.first()) else { return Ok(None) };
+        let columns = grid
+            .world_from_index
+            .ok_or(GpuError::Unsupported { feature: "a transform that is not linear" })?;
+        let world_from_source = DAffine3::from_cols_array(&columns);
+        let offset = IVec3::from_array(grid.index_offset);
+        let first_cell = self.trees.cells.len() as u32;
+        let info = &asset.contents().channels[channel];
+        for cell in asset.trees().cells_of(*tree) {
+            let entry = self.node5(asset, channel, cell.entry, form, gathered)?;
+            self.trees.cells.push(RootCell { entry, ..*cell });
+        }
+        Ok(Some(place_of(info, tree, world_from_source, offset, [min, max], first_cell, meaning)))
+    }
+
+    /// An entry of a root, with all below it.
+    fn node5(
+        &mut self,
+        asset: &Asset,
+        channel: usize,
+        entry: Entry,
+        form: Bricks,
+        gathered: &mut Gathered,
+    ) -> Result<Entry, GpuError> {
+        let Some(Content::Node(index)) = entry.content() else { return Ok(entry) };
+        let payload = match gathered.node5s.get(&(channel, index)) {
+            Some(known) => *known,
+            None => {
+                let node = asset.trees().node5s.get(index as usize).ok_or_else(damaged)?;
+                let entries = entries_of(asset.trees(), node, NODE5_SLOTS)?;
+                let below: Result<Vec<Entry>, GpuError> =
+                    entries.iter().map(|entry| self.node4(asset, channel, *entry, form, gathered)).collect();
+                let node = self.add_node(asset.trees(), node, NODE5_SLOTS, below?, gathered)?;
+                self.trees.node5s.push(node);
+                let new = self.trees.node5s.len() as u32 - 1;
+                gathered.node5s.insert((channel, index), new);
+                new
+            }
+        };
+        Ok(Entry { payload, ..entry })
+    }
+
+    /// An entry of a `Node5`, with all below it.
+    fn node4(
+        &mut self,
+        asset: &Asset,
+        channel: usize,
+        entry: Entry,
+        form: Bricks,
+        gathered: &mut Gathered,
+    ) -> Result<Entry, GpuError> {
+        let Some(Content::Node(index)) = entry.content() else { return Ok(entry) };
+        let payload = match gathered.node4s.get(&(channel, index)) {
+            Some(known) => *known,
+            None => {
+                let node = asset.trees().node4s.get(index as usize).ok_or_else(damaged)?;
+                let entries = entries_of(asset.trees(), node, NODE4_SLOTS)?;
+                let below: Result<Vec<Entry>, GpuError> =
+                    entries.iter().map(|entry| self.brick(asset, channel, *entry, form, gathered)).collect();
+                let node = self.add_node(asset.trees(), node, NODE4_SLOTS, below?, gathered)?;
+                self.trees.node4s.push(node);
+                let new = self.trees.node4s.len() as u32 - 1;
+                gathered.node4s.insert((channel, index), new);
+                new
+            }
+        };
+        Ok(Entry { payload, ..entry })
+    }
+
+    /// An entry of a `Node4`, with its brick.
+    fn brick(
+        &mut self,
+        asset: &Asset,
+        channel: usize,
+        entry: Entry,
+        form: Bricks,
+        gathered: &mut Gathered,
+    ) -> Result<Entry, GpuError> {
+        let Some(Content::Brick { codec, offset }) = entry.content() else { return Ok(entry) };
+        // Words mean the same in all channels, values do not.
+        let (key, kept) = match form {
+            Bricks::AsStored => ((0, offset), codec),
+            Bricks::Decoded => ((channel, offset), Codec::F32),
+        };
+        let payload = match gathered.bricks.get(&key) {
+            Some(known) => *known,
+            None => {
+                let at = u32::try_from(self.words.len() + BRICK_VOXELS).map_err(|_| too_many_words())?;
+                let at = at - BRICK_VOXELS as u32;
+                // Decoding is also what finds a damaged brick before a shader meets it.
+                let mut values = [0.0; BRICK_VOXELS];
+                asset.decode(channel, codec, offset, &mut values)?;
+                match form {
+                    Bricks::Decoded => self.words.extend(values.iter().map(|value| value.to_bits())),
+                    Bricks::AsStored => self.words.extend_from_slice(stored_words(asset, codec, offset)?),
+                }
+                self.codecs |= codec_bit(kept);
+                gathered.bricks.insert(key, at);
+                at
+            }
+        };
+        Ok(Entry { payload, kind: entry.kind & !0xff | u32::from(kept.tag()) })
+    }
+
+    /// A node of other entries.
+    fn add_node(
+        &mut self,
+        trees: &Trees,
+        node: &Node,
+        slots: usize,
+        entries: Vec<Entry>,
+        gathered: &mut Gathered,
+    ) -> Result<Node, GpuError> {
+        let mask = match gathered.masks.get(&node.mask) {
+            Some(known) => *known,
+            None => {
+                let begin = node.mask as usize;
+                let len = mask::len(&trees.masks, node.mask, slots).ok_or_else(damaged)?;
+                let new = self.trees.masks.len() as u32;
+                self.trees.masks.extend_from_slice(trees.masks.get(begin..begin + len).ok_or_else(damaged)?);
+                gathered.masks.insert(node.mask, new);
+                new
+            }
+        };
+        let first_entry = u32::try_from(self.trees.entries.len()).map_err(|_| too_many_words())?;
+        self.trees.entries.extend(entries);
+        Ok(Node { mask, first_entry })
+    }
+
+    /// Puts the origin of the shaders' world into the middle of what is there.
+    fn settle(&mut self) {
+        let corners = self.places.iter().flatten().flat_map(Place::world_corners);
+        let (sum, count) =
+            corners.fold((DVec3::ZERO, 0.0), |(sum, count), corner| (sum + corner, count + 1.0));
+        let middle = sum / f64::max(count, 1.0);
+        self.origin = if middle.is_finite() { middle } else { DVec3::ZERO };
+    }
+
+    /// How many channels each frame has.
+    pub fn channels(&self) -> usize {
+        self.channels
+    }
+
+    /// How many frames there are.
+    pub fn frames(&self) -> usize {
+        self.places.len().checked_div(self.channels).unwrap_or(0)
+    }
+
+    /// The bytes of trees, and of bricks and shapes.
+    pub fn size_bytes(&self) -> [usize; 2] {
+        [self.trees.size_bytes(), size_of::<u32>() * (self.words.len() + self.shapes.len())]
+    }
+
+    pub(crate) fn codecs(&self) -> u32 {
+        self.codecs
+    }
+
+    pub(crate) fn origin(&self) -> DVec3 {
+        self.origin
+    }
+
+    /// Where a channel is in a frame.
+    pub(crate) fn place(&self, frame: usize, channel: usize) -> Option<&Place> {
+        self.places.get(frame * self.channels + channel)?.as_ref()
+    }
+
+    /// The largest value of a channel in all frames.
+    pub(crate) fn largest(&self, channel: usize) -> f32 {
+        self.largest.get(channel).copied().unwrap_or(0.0)
+    }
+
+    /// All fields, frame by frame. One at least, since no buffer is empty.
+    pub(crate) fn fields(&self) -> Vec<Field> {
+        let field =
+            |place: &Option<Place>| place.as_ref().map_or_else(Field::default, |p| p.field(self.origin));
+        let mut fields: Vec<Field> = self.places.iter().map(field).collect();
+        if fields.is_empty() {
+            fields.push(Field::default());
+        }
+        fields
+    }
+
+    /// The trees in one array of words, which begins by saying where each of them does.
+    pub(crate) fn tree_words(&self) -> Vec<u32> {
+        let Trees { cells, node5s, node4s, entries, masks } = &self.trees;
+        let arrays: [&[u32]; 5] = [
+            bytemuck::cast_slice(cells),
+            bytemuck::cast_slice(node5s),
+            bytemuck::cast_slice(node4s),
+            bytemuck::cast_slice(entries),
+            masks,
+        ];
+        let mut words =
+            Vec::with_capacity(HEADER_WORDS + arrays.iter().map(|array| array.len()).sum::<usize>());
+        let mut at = HEADER_WORDS as u32;
+        for array in arrays {
+            words.push(at);
+            at += array.len() as u32;
+        }
+        words.extend([self.words.len() as u32, self.channels as u32]);
+        words.resize(HEADER_WORDS, 0);
+        arrays.iter().for_each(|array| words.extend_from_slice(array));
+        words
+    }
+
+    /// The words of bricks, and of shapes behind them.
+    pub(crate) fn brick_words(&self) -> [&[u32]; 2] {
+        [&self.words, &self.shapes]
+    }
+}
+
+fn place_of(
+    info: &ChannelInfo,
+    tree: &TreeRef,
+    world_from_source: DAffine3,
+    offset: IVec3,
+    [min, max]: [[i32; 3]; 2],
+    first_cell: u32,
+    meaning: Meaning,
+) -> Place {
+    Place {
+        world_from_index: world_from_source * DAffine3::from_translation(offset.as_dvec3()),
+        active_box: IndexBox { min: IVec3::from_array(min) - offset, max: IVec3::from_array(max) - offset },
+        index_offset: offset,
+        cells: [first_cell, tree.cell_count],
+        brick_unit: info.unit,
+        bounds_unit: info.unit,
+        floor: info.floor,
+        meaning: meaning.line(),
+    }
+}
+
+/// The entries of a node.
+fn entries_of<'t>(trees: &'t Trees, node: &Node, slots: usize) -> Result<&'t [Entry], GpuError> {
+    let bits = mask::decode(&trees.masks, node.mask, slots).ok_or_else(damaged)?;
+    let count = bits.iter().map(|word| word.count_ones() as usize).sum::<usize>();
+    let first = node.first_entry as usize;
+    trees.entries.get(first..first + count).ok_or_else(damaged)
+}
+
+/// The words of a brick in a page that is loaded.
+fn stored_words(asset: &Asset, codec: Codec, offset: u32) -> Result<&[u32], GpuError> {
+    let store = asset.store();
+    let page = store.page_of(offset).and_then(|page| store.pages().get(page)).ok_or_else(damaged)?;
+    let begin = (offset - page.first_word) as usize;
+    page.words().and_then(|words| words.get(begin..begin + codec.word_count())).ok_or_else(damaged)
+}
+
+fn damaged() -> GpuError {
+    GpuError::Misuse("a volume whose trees name what is not there".to_owned())
+}
+
+fn too_many_words() -> GpuError {
+    GpuError::Misuse("a volume of more than 2³² words: take fewer frames".to_owned())
+}
+
+/// The smallest power of two that is not less than a finite number; 1 for 0.
+fn power_of_two_above(value: f32) -> f32 {
+    if value <= 0.0 {
+        return 1.0;
+    }
+    let bits = value.max(f32::MIN_POSITIVE).to_bits();
+    let is_exact = bits & 0x007f_ffff == 0;
+    // Above 2¹²⁷ there is no power of two: bounds are then too low by less than half, which only what is 10³⁸ dense has.
+    let exponent = ((bits >> 23) + u32::from(!is_exact)).min(254);
+    f32::from_bits(exponent << 23)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn units_are_powers_of_two_not_less_than_what_they_count() {
+        for (value, unit) in [(0.0, 1.0), (1.0, 1.0), (1.1, 2.0), (0.3, 0.5), (65504.0, 65536.0)] {
+            assert_eq!(power_of_two_above(value), unit, "{value}");
+        }
+    }
+}

@@ -1,0 +1,216 @@
+//! Finding a device and talking to it: by name or the best there is, with no window, or one that a host owns.
+//!
+//! What does not live here: buffers of volumes ([`crate::upload`]) and pipelines ([`crate::renderer`]).
+
+use std::sync::{Arc, Mutex, PoisonError};
+
+use crate::error::GpuError;
+
+/// Which device to use.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Wanted {
+    /// A graphics card if there is one, else whatever there is.
+    Best,
+    /// The first whose name holds this text, in any case.
+    Name(String),
+}
+
+/// A device, its queue, and what it has complained of.
+#[derive(Debug, Clone)]
+pub struct Gpu {
+    device: wgpu::Device,
+    queue: wgpu::Queue,
+    name: String,
+    fault: Arc<Mutex<Option<GpuError>>>,
+}
+
+/// The names of all devices, the best first.
+pub fn names() -> Vec<String> {
+    adapters().iter().map(|adapter| adapter.get_info().name).collect()
+}
+
+/// All devices, the best first.
+fn adapters() -> Vec<wgpu::Adapter> {
+    let instance = wgpu::Instance::new(wgpu::InstanceDescriptor::new_without_display_handle());
+    let mut adapters = pollster::block_on(instance.enumerate_adapters(wgpu::Backends::PRIMARY));
+    adapters.sort_by_key(|adapter| match adapter.get_info().device_type {
+        wgpu::DeviceType::DiscreteGpu => 0,
+        wgpu::DeviceType::IntegratedGpu => 1,
+        wgpu::DeviceType::VirtualGpu => 2,
+        wgpu::DeviceType::Other => 3,
+        wgpu::DeviceType::Cpu => 4,
+    });
+    adapters
+}
+
+impl Gpu {
+    /// Opens a device.
+    ///
+    /// # Errors
+    /// If there is none, or it does not open.
+    pub fn open(wanted: &Wanted) -> Result<Gpu, GpuError> {
+        let adapters = adapters();
+        let name_of = |adapter: &wgpu::Adapter| adapter.get_info().name;
+        let found = match wanted {
+            Wanted::Best => adapters.first(),
+            Wanted::Name(name) => {
+                let name = name.to_lowercase();
+                adapters.iter().find(|adapter| name_of(adapter).to_lowercase().contains(&name))
+            }
+        };
+        let Some(adapter) = found else {
+            let wanted = match wanted {
+                Wanted::Best => None,
+                Wanted::Name(name) => Some(name.clone()),
+            };
+            return Err(GpuError::NoDevice { wanted, found: adapters.iter().map(name_of).collect() });
+        };
+        // Everything runs within the limits of WebGPU; larger buffers are taken where the device has them.
+        let offered = adapter.limits();
+        let required_limits = wgpu::Limits {
+            max_buffer_size: offered.max_buffer_size,
+            max_storage_buffer_binding_size: offered.max_storage_buffer_binding_size,
+            ..wgpu::Limits::default()
+        };
+        let descriptor = wgpu::DeviceDescriptor {
+            label: Some("nuage"),
+            required_features: adapter.features() & wgpu::Features::TIMESTAMP_QUERY,
+            required_limits,
+            ..Default::default()
+        };
+        let opened = pollster::block_on(adapter.request_device(&descriptor));
+        let (device, queue) = opened.map_err(|error| GpuError::Device(error.to_string()))?;
+        let gpu = Gpu::from_host(device, queue, name_of(adapter));
+        // A device of our own tells us of its faults; by default they would end the program.
+        let fault = Arc::clone(&gpu.fault);
+        gpu.device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| keep(&fault, error.to_string())));
+        let fault = Arc::clone(&gpu.fault);
+        gpu.device.set_device_lost_callback(move |reason, message| {
+            if reason != wgpu::DeviceLostReason::Destroyed {
+                keep(&fault, format!("the device is lost: {message}"));
+            }
+        });
+        Ok(gpu)
+    }
+
+    /// A device that somebody else opened and goes on using. Its handlers of faults stay as they are.
+    pub fn from_host(device: wgpu::Device, queue: wgpu::Queue, name: String) -> Gpu {
+        Gpu { device, queue, name, fault: Arc::default() }
+    }
+
+    /// The name of the device.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// The device itself.
+    pub fn device(&self) -> &wgpu::Device {
+        &self.device
+    }
+
+    /// Its queue.
+    pub fn queue(&self) -> &wgpu::Queue {
+        &self.queue
+    }
+
+    /// Does something with the device, whose complaints become errors.
+    ///
+    /// # Errors
+    /// If the device is lost, runs out of memory, or refuses something.
+    pub(crate) fn guarded<T>(&self, run: impl FnOnce() -> T) -> Result<T, GpuError> {
+        self.health()?;
+        let filters =
+            [wgpu::ErrorFilter::OutOfMemory, wgpu::ErrorFilter::Internal, wgpu::ErrorFilter::Validation];
+        let scopes = filters.map(|filter| self.device.push_error_scope(filter));
+        let result = run();
+        let mut found = None;
+        // The scope that was opened last closes first.
+        for scope in scopes.into_iter().rev() {
+            found = pollster::block_on(scope.pop()).or(found);
+        }
+        match found {
+            Some(error) => Err(GpuError::Device(error.to_string())),
+            None => self.health().map(|()| result),
+        }
+    }
+
+    /// Whether the device still works.
+    ///
+    /// # Errors
+    /// Its first complaint since it was opened.
+    pub fn health(&self) -> Result<(), GpuError> {
+        self.fault.lock().unwrap_or_else(PoisonError::into_inner).clone().map_or(Ok(()), Err)
+    }
+
+    /// Waits until the device has done all that was submitted.
+    ///
+    /// # Errors
+    /// If it is lost.
+    pub fn wait(&self) -> Result<(), GpuError> {
+        let waited = self.device.poll(wgpu::PollType::wait_indefinitely());
+        waited.map_err(|error| GpuError::Device(error.to_string()))?;
+        self.health()
+    }
+
+    /// A buffer of these bytes.
+    ///
+    /// # Errors
+    /// If the device has no memory left.
+    pub(crate) fn buffer(
+        &self,
+        label: &str,
+        bytes: &[u8],
+        usage: wgpu::BufferUsages,
+    ) -> Result<wgpu::Buffer, GpuError> {
+        let buffer = self.empty_buffer(label, bytes.len() as u64, usage | wgpu::BufferUsages::COPY_DST)?;
+        self.guarded(|| self.queue.write_buffer(&buffer, 0, bytes))?;
+        Ok(buffer)
+    }
+
+    /// A buffer of zeros.
+    ///
+    /// # Errors
+    /// If the device has no memory left.
+    pub(crate) fn empty_buffer(
+        &self,
+        label: &str,
+        size: u64,
+        usage: wgpu::BufferUsages,
+    ) -> Result<wgpu::Buffer, GpuError> {
+        let descriptor =
+            wgpu::BufferDescriptor { label: Some(label), size, usage, mapped_at_creation: false };
+        self.guarded(|| self.device.create_buffer(&descriptor))
+    }
+
+    /// The bytes of a buffer, which must be a source of copies, once all that was submitted is done.
+    ///
+    /// # Errors
+    /// If the device is lost or has no memory left.
+    pub fn read(&self, buffer: &wgpu::Buffer) -> Result<Vec<u8>, GpuError> {
+        let usage = wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::MAP_READ;
+        let staging = self.empty_buffer("nuage read-back", buffer.size(), usage)?;
+        self.guarded(|| {
+            let mut encoder = self.device.create_command_encoder(&Default::default());
+            encoder.copy_buffer_to_buffer(buffer, 0, &staging, 0, buffer.size());
+            self.queue.submit([encoder.finish()]);
+        })?;
+        let mapped: Arc<Mutex<Option<Result<(), wgpu::BufferAsyncError>>>> = Arc::default();
+        let result = Arc::clone(&mapped);
+        staging.slice(..).map_async(wgpu::MapMode::Read, move |outcome| {
+            *result.lock().unwrap_or_else(PoisonError::into_inner) = Some(outcome);
+        });
+        self.wait()?;
+        let outcome = mapped.lock().unwrap_or_else(PoisonError::into_inner).take();
+        if !matches!(outcome, Some(Ok(()))) {
+            return Err(GpuError::Device("a buffer could not be read back".to_owned()));
+        }
+        let range = staging.slice(..).get_mapped_range();
+        let range = range.map_err(|error| GpuError::Device(error.to_string()))?;
+        Ok(range.to_vec())
+    }
+}
+
+/// Keeps the first fault.
+fn keep(fault: &Mutex<Option<GpuError>>, message: String) {
+    fault.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(GpuError::Device(message));
+}

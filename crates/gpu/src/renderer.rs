@@ -1,0 +1,405 @@
+//! Recording passes: pipelines made when they are first needed, one picture of sums, and its way to a target.
+//!
+//! A [`Renderer`] works in the encoder of whoever owns the device. Which frame is shown is one number in the parameters;
+//! changing it allocates nothing.
+
+use std::collections::HashMap;
+
+use glam::DMat4;
+use nuage_render::scene::Spectrum;
+use nuage_render::views::View;
+
+use crate::device::Gpu;
+use crate::error::GpuError;
+use crate::look::{Look, Pass, world_from_clip};
+use crate::params::Params;
+use crate::shader::{Features, Source, WORKGROUP_SIDE, tables};
+use crate::upload::{Volume, bind, buffer_entry, storage_entry};
+
+/// A host's depth buffer, in front of which the volume ends.
+#[derive(Debug, Clone, Copy)]
+pub struct Depth<'a> {
+    /// The depth buffer, of one sample, of any size.
+    pub view: &'a wgpu::TextureView,
+    /// What took the host's world to its clip space, ordinary, reversed or without a far end.
+    pub clip_from_world: DMat4,
+}
+
+/// Renders one volume at a time into a picture on the device.
+#[derive(Debug)]
+pub struct Renderer {
+    gpu: Gpu,
+    size: [u32; 2],
+    params: wgpu::Buffer,
+    picture: wgpu::Buffer,
+    /// For compute passes, and for those that show the picture.
+    groups: [(wgpu::BindGroupLayout, wgpu::BindGroup); 2],
+    depth_layout: wgpu::BindGroupLayout,
+    depth: Option<wgpu::BindGroup>,
+    pipelines: HashMap<(Source, Features), wgpu::ComputePipeline>,
+    targets: HashMap<wgpu::TextureFormat, wgpu::RenderPipeline>,
+    /// What the next [`Renderer::record`] runs, and whether it starts from nothing.
+    prepared: Option<((Source, Features), bool)>,
+    current: Params,
+}
+
+impl Renderer {
+    /// A renderer of pictures of a size.
+    ///
+    /// # Errors
+    /// If there are no pixels or too many, or the device fails.
+    pub fn new(gpu: &Gpu, size: [u32; 2]) -> Result<Renderer, GpuError> {
+        let [width, height] = size.map(u64::from);
+        let bytes = 16 * width * height;
+        let limits = gpu.device().limits();
+        let limit_bytes = limits.max_storage_buffer_binding_size.min(limits.max_buffer_size);
+        if bytes == 0 {
+            return Err(GpuError::Misuse("a picture without pixels".to_owned()));
+        }
+        if bytes > limit_bytes {
+            return Err(GpuError::Limit { what: "a picture", size_bytes: bytes, limit_bytes });
+        }
+        let usage = wgpu::BufferUsages::COPY_DST;
+        let params_bytes = size_of::<Params>() as u64;
+        let params =
+            gpu.empty_buffer("nuage parameters", params_bytes, usage | wgpu::BufferUsages::UNIFORM)?;
+        let usage = usage | wgpu::BufferUsages::COPY_SRC | wgpu::BufferUsages::STORAGE;
+        let picture = gpu.empty_buffer("nuage picture", bytes, usage)?;
+        let group = |stage, is_read| {
+            let uniform = buffer_entry(0, stage, wgpu::BufferBindingType::Uniform);
+            let entries = [uniform, storage_entry(1, is_read, stage)];
+            let descriptor = wgpu::BindGroupLayoutDescriptor { label: Some("nuage pass"), entries: &entries };
+            let layout = gpu.guarded(|| gpu.device().create_bind_group_layout(&descriptor))?;
+            let bind_group = bind(gpu, "nuage pass", &layout, &[&params, &picture])?;
+            Ok::<_, GpuError>((layout, bind_group))
+        };
+        let groups = [group(wgpu::ShaderStages::COMPUTE, false)?, group(wgpu::ShaderStages::FRAGMENT, true)?];
+        let depth_entry = wgpu::BindGroupLayoutEntry {
+            binding: 0,
+            visibility: wgpu::ShaderStages::COMPUTE,
+            ty: wgpu::BindingType::Texture {
+                sample_type: wgpu::TextureSampleType::Depth,
+                view_dimension: wgpu::TextureViewDimension::D2,
+                multisampled: false,
+            },
+            count: None,
+        };
+        let descriptor =
+            wgpu::BindGroupLayoutDescriptor { label: Some("nuage depth"), entries: &[depth_entry] };
+        let depth_layout = gpu.guarded(|| gpu.device().create_bind_group_layout(&descriptor))?;
+        Ok(Renderer {
+            gpu: gpu.clone(),
+            size,
+            params,
+            picture,
+            groups,
+            depth_layout,
+            depth: None,
+            pipelines: HashMap::new(),
+            targets: HashMap::new(),
+            prepared: None,
+            current: Params::default(),
+        })
+    }
+
+    /// The size of the picture, in pixels.
+    pub fn size(&self) -> [u32; 2] {
+        self.size
+    }
+
+    /// Settles what the next [`Renderer::record`] does. Makes a pipeline if there is none of the kind yet.
+    ///
+    /// # Errors
+    /// If the pass cannot show the look, there is no such frame, or the device fails.
+    pub fn prepare(
+        &mut self,
+        volume: &Volume,
+        look: &Look,
+        pass: &Pass,
+        frame: usize,
+        depth: Option<&Depth<'_>>,
+    ) -> Result<(), GpuError> {
+        check_frame(volume, frame)?;
+        let source = match pass {
+            Pass::View(View::Surface { .. }) | Pass::SurfaceHits { .. } => Source::Surface,
+            Pass::View(_) | Pass::Hits => Source::Views,
+            Pass::March(_) => Source::March,
+            Pass::Path { .. } => Source::Path,
+        };
+        self.prepare_shader(volume, look, pass, frame, depth, source)
+    }
+
+    fn prepare_shader(
+        &mut self,
+        volume: &Volume,
+        look: &Look,
+        pass: &Pass,
+        frame: usize,
+        depth: Option<&Depth<'_>>,
+        source: Source,
+    ) -> Result<(), GpuError> {
+        let mut params = look.params(volume, pass, self.size, frame)?;
+        let (chunks, log2_chunk_words) = volume.chunks();
+        let is_lit = matches!(source, Source::March | Source::Path);
+        let features = Features {
+            codecs: volume.codecs(),
+            chunks,
+            log2_chunk_words,
+            glow_channel: look.glow.as_ref().filter(|_| is_lit).map(|(channel, _)| *channel as u32),
+            is_grey: look.is_grey() || !is_lit,
+            has_depth: depth.is_some() && is_lit,
+            encodes_srgb: false,
+        };
+        if let Some(depth) = depth {
+            [params.clip_x, params.clip_y, params.clip_z, params.clip_w] =
+                world_from_clip(&depth.clip_from_world, volume.origin());
+            let entry =
+                wgpu::BindGroupEntry { binding: 0, resource: wgpu::BindingResource::TextureView(depth.view) };
+            let descriptor = wgpu::BindGroupDescriptor {
+                label: Some("nuage depth"),
+                layout: &self.depth_layout,
+                entries: &[entry],
+            };
+            self.depth = Some(self.gpu.guarded(|| self.gpu.device().create_bind_group(&descriptor))?);
+        }
+        let key = (source, features);
+        if !self.pipelines.contains_key(&key) {
+            let pipeline = self.pipeline(volume, source, &features)?;
+            self.pipelines.insert(key, pipeline);
+        }
+        if let Some((_, Spectrum::Blackbody { table, .. })) = &look.glow {
+            let at = 4 * tables::BLACKBODY as u64;
+            let bytes = bytemuck::cast_slice(table.table());
+            self.gpu.guarded(|| self.gpu.queue().write_buffer(volume.tables(), at, bytes))?;
+        }
+        let is_first = !matches!(pass, Pass::Path { sample: 1.., .. });
+        self.prepared = Some((key, is_first));
+        self.current = params;
+        self.write_params()
+    }
+
+    /// As [`Renderer::prepare`], for a shader of tests, which goes on from what the picture holds.
+    #[cfg(test)]
+    pub(crate) fn prepare_source(
+        &mut self,
+        volume: &Volume,
+        look: &Look,
+        pass: &Pass,
+        source: Source,
+    ) -> Result<(), GpuError> {
+        self.prepare_shader(volume, look, pass, 0, None, source)?;
+        self.prepared = self.prepared.map(|(key, _)| (key, false));
+        Ok(())
+    }
+
+    /// Sets the picture.
+    #[cfg(test)]
+    pub(crate) fn write_pixels(&self, pixels: &[[f32; 4]]) -> Result<(), GpuError> {
+        let bytes = bytemuck::cast_slice(pixels);
+        self.gpu.guarded(|| self.gpu.queue().write_buffer(&self.picture, 0, bytes))
+    }
+
+    /// Shows another frame from the next [`Renderer::record`] on: writes one number. Distances of the depth view stay those
+    /// of the frame that was prepared.
+    ///
+    /// # Errors
+    /// If there is no such frame, or the device fails.
+    pub fn set_frame(&mut self, volume: &Volume, frame: usize) -> Result<(), GpuError> {
+        check_frame(volume, frame)?;
+        self.current.size[2] = frame as u32;
+        let at = (std::mem::offset_of!(Params, size) + 2 * size_of::<u32>()) as u64;
+        let bytes = (frame as u32).to_le_bytes();
+        self.gpu.guarded(|| self.gpu.queue().write_buffer(&self.params, at, &bytes))
+    }
+
+    fn write_params(&self) -> Result<(), GpuError> {
+        let bytes = bytemuck::bytes_of(&self.current);
+        self.gpu.guarded(|| self.gpu.queue().write_buffer(&self.params, 0, bytes))
+    }
+
+    fn pipeline(
+        &self,
+        volume: &Volume,
+        source: Source,
+        features: &Features,
+    ) -> Result<wgpu::ComputePipeline, GpuError> {
+        let device = self.gpu.device();
+        let text = source.text(features);
+        self.gpu.guarded(|| {
+            let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
+                label: Some(source.entry_point()),
+                source: wgpu::ShaderSource::Wgsl(text.into()),
+            });
+            let [(pass_layout, _), _] = &self.groups;
+            let mut layouts = vec![Some(volume.layout()), Some(pass_layout)];
+            if features.has_depth {
+                layouts.push(Some(&self.depth_layout));
+            }
+            let layout = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
+                label: Some(source.entry_point()),
+                bind_group_layouts: &layouts,
+                immediate_size: 0,
+            });
+            device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+                label: Some(source.entry_point()),
+                layout: Some(&layout),
+                module: &module,
+                entry_point: Some(source.entry_point()),
+                compilation_options: wgpu::PipelineCompilationOptions::default(),
+                cache: None,
+            })
+        })
+    }
+
+    /// Records what was prepared into an encoder: the picture is there once that is submitted and done.
+    ///
+    /// # Errors
+    /// If nothing was prepared.
+    pub fn record(&mut self, encoder: &mut wgpu::CommandEncoder, volume: &Volume) -> Result<(), GpuError> {
+        let nothing = || GpuError::Misuse("nothing was prepared to be recorded".to_owned());
+        let (key, is_first) = self.prepared.ok_or_else(nothing)?;
+        let pipeline = self.pipelines.get(&key).ok_or_else(nothing)?;
+        if is_first {
+            encoder.clear_buffer(&self.picture, 0, None);
+        }
+        let descriptor = wgpu::ComputePassDescriptor { label: Some("nuage"), timestamp_writes: None };
+        let mut pass = encoder.begin_compute_pass(&descriptor);
+        pass.set_pipeline(pipeline);
+        pass.set_bind_group(0, volume.bind_group(), &[]);
+        let [(_, group), _] = &self.groups;
+        pass.set_bind_group(1, group, &[]);
+        if let Some(depth) = self.depth.as_ref().filter(|_| key.1.has_depth) {
+            pass.set_bind_group(2, depth, &[]);
+        }
+        let [x, y] = self.size.map(|side| side.div_ceil(WORKGROUP_SIDE));
+        pass.dispatch_workgroups(x, y, 1);
+        Ok(())
+    }
+
+    /// Records the way of the picture to a target: its light times `exposure`, over what the target shows already. Light
+    /// above 1 is cut off where the target cannot hold it.
+    ///
+    /// # Errors
+    /// If the device fails.
+    pub fn composite(
+        &mut self,
+        encoder: &mut wgpu::CommandEncoder,
+        target: &wgpu::TextureView,
+        exposure: f32,
+    ) -> Result<(), GpuError> {
+        let texture = target.texture();
+        let (format, size) = (texture.format(), texture.size());
+        if !self.targets.contains_key(&format) {
+            let pipeline = self.target(format)?;
+            self.targets.insert(format, pipeline);
+        }
+        self.current.tone[0] = exposure;
+        self.current.tone[2] = self.size[0] as f32 / size.width as f32;
+        self.current.tone[3] = self.size[1] as f32 / size.height as f32;
+        self.write_params()?;
+        let attachment = wgpu::RenderPassColorAttachment {
+            view: target,
+            depth_slice: None,
+            resolve_target: None,
+            ops: wgpu::Operations { load: wgpu::LoadOp::Load, store: wgpu::StoreOp::Store },
+        };
+        let mut pass = encoder.begin_render_pass(&wgpu::RenderPassDescriptor {
+            label: Some("nuage composite"),
+            color_attachments: &[Some(attachment)],
+            depth_stencil_attachment: None,
+            timestamp_writes: None,
+            occlusion_query_set: None,
+            multiview_mask: None,
+        });
+        pass.set_pipeline(&self.targets[&format]);
+        let [_, (_, group)] = &self.groups;
+        pass.set_bind_group(1, group, &[]);
+        pass.draw(0..3, 0..1);
+        Ok(())
+    }
+
+    fn target(&self, format: wgpu::TextureFormat) -> Result<wgpu::RenderPipeline, GpuError> {
+        let device = self.gpu.device();
+        // Eight bits hold encoded colours; formats that say so encode by themselves, and those of floats hold light.
+        let is_unorm = format.sample_type(None, None).is_some_and(|_| !format.is_srgb())
+            && matches!(format, wgpu::TextureFormat::Rgba8Unorm | wgpu::TextureFormat::Bgra8Unorm);
+        let features = Features {
+            codecs: 0,
+            chunks: 0,
+            log2_chunk_words: 0,
+            glow_channel: None,
+            is_grey: true,
+            has_depth: false,
+            encodes_srgb: is_unorm,
+        };
+        let text = Source::Tone.text(&features);
+        self.gpu.guarded(|| {
+            let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
+                label: Some("nuage tone"),
+                source: wgpu::ShaderSource::Wgsl(text.into()),
+            });
+            let [_, (pass_layout, _)] = &self.groups;
+            let layout = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
+                label: Some("nuage tone"),
+                bind_group_layouts: &[None, Some(pass_layout)],
+                immediate_size: 0,
+            });
+            let over = wgpu::BlendState::PREMULTIPLIED_ALPHA_BLENDING;
+            device.create_render_pipeline(&wgpu::RenderPipelineDescriptor {
+                label: Some("nuage tone"),
+                layout: Some(&layout),
+                vertex: wgpu::VertexState {
+                    module: &module,
+                    entry_point: Some("whole_screen"),
+                    compilation_options: wgpu::PipelineCompilationOptions::default(),
+                    buffers: &[],
+                },
+                primitive: wgpu::PrimitiveState::default(),
+                depth_stencil: None,
+                multisample: wgpu::MultisampleState::default(),
+                fragment: Some(wgpu::FragmentState {
+                    module: &module,
+                    entry_point: Some(Source::Tone.entry_point()),
+                    compilation_options: wgpu::PipelineCompilationOptions::default(),
+                    targets: &[Some(wgpu::ColorTargetState {
+                        format,
+                        blend: Some(over),
+                        write_mask: wgpu::ColorWrites::ALL,
+                    })],
+                }),
+                multiview_mask: None,
+                cache: None,
+            })
+        })
+    }
+
+    /// Runs what was prepared, and waits for it.
+    ///
+    /// # Errors
+    /// If nothing was prepared, or the device fails.
+    pub fn run(&mut self, volume: &Volume) -> Result<(), GpuError> {
+        let mut encoder =
+            self.gpu.device().create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
+        self.record(&mut encoder, volume)?;
+        self.gpu.guarded(|| self.gpu.queue().submit([encoder.finish()]))?;
+        self.gpu.wait()
+    }
+
+    /// The picture, row by row: colour times opacity, and opacity; of paths their mean.
+    ///
+    /// # Errors
+    /// If the device fails.
+    pub fn pixels(&self) -> Result<Vec<[f32; 4]>, GpuError> {
+        let bytes = self.gpu.read(&self.picture)?;
+        let floats: Vec<[f32; 4]> = bytemuck::pod_collect_to_vec(&bytes);
+        let share = self.current.tone[1];
+        Ok(floats.into_iter().map(|pixel| pixel.map(|value| value * share)).collect())
+    }
+}
+
+fn check_frame(volume: &Volume, frame: usize) -> Result<(), GpuError> {
+    match frame < volume.frames() {
+        true => Ok(()),
+        false => Err(GpuError::Misuse(format!("frame {frame} of {}", volume.frames()))),
+    }
+}

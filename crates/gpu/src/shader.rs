@@ -1,0 +1,460 @@
+//! Shaders as text: a prelude of constants that are printed from the Rust that they belong to, then the files of
+//! `shader/` in an order such that each pass has what it calls. No number stands in both.
+//!
+//! What does not live here: pipelines ([`crate::renderer`]).
+
+use std::fmt::Write as _;
+
+use nuage_render::color::Blackbody;
+use nuage_render::{color, hash, march, math, path, phase, surface, traverse};
+use nuage_volume::brick::f32_from_finite_f16;
+use nuage_volume::codec::block::{BlockFormat, PackingAxis, bc7};
+use nuage_volume::codec::{self, Codec, bounds, sparse};
+use nuage_volume::packed::{Entry, RootCell};
+use nuage_volume::space::{LOG2_BRICK, LOG2_NODE4_BRICKS, LOG2_NODE5_BRICKS, NODE4_SLOTS, NODE5_SLOTS};
+
+use crate::params::{self, MAX_LIGHTS};
+
+/// Pixels along each side of a workgroup.
+pub(crate) const WORKGROUP_SIDE: u32 = 8;
+/// The tag of an entry that is not there.
+const ABSENT_TAG: u32 = 254;
+/// The words in front of the arrays of trees that say where each begins.
+pub(crate) const HEADER_WORDS: usize = 8;
+
+/// What a shader is made for: what does not occur is left out of it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub(crate) struct Features {
+    /// The kinds of codecs that occur, by [`CODEC_KINDS`].
+    pub(crate) codecs: u32,
+    /// How many buffers hold the bricks.
+    pub(crate) chunks: u32,
+    /// log2 of the words of such a buffer.
+    pub(crate) log2_chunk_words: u32,
+    /// Whether a channel glows, and its place among the channels.
+    pub(crate) glow_channel: Option<u32>,
+    /// Whether extinction is the same for all colours.
+    pub(crate) is_grey: bool,
+    /// Whether rays end at a host's depth buffer.
+    pub(crate) has_depth: bool,
+    /// Whether a target takes encoded colours.
+    pub(crate) encodes_srgb: bool,
+}
+
+#[cfg(test)]
+impl Features {
+    /// All there is.
+    pub(crate) const ALL: Features = Features {
+        codecs: u32::MAX,
+        chunks: 2,
+        log2_chunk_words: 25,
+        glow_channel: Some(1),
+        is_grey: false,
+        has_depth: false,
+        encodes_srgb: true,
+    };
+}
+
+/// The kinds of codecs of which decoders can be left out.
+const CODEC_KINDS: [&str; 9] =
+    ["F32", "F16", "UNIFORM", "SPARSE", "SPLIT", "BLOCK", "LATTICE", "GRADIENT", "SHARED"];
+
+/// The bit of a codec's kind.
+pub(crate) fn codec_bit(codec: Codec) -> u32 {
+    let kind = match codec {
+        Codec::Constant => return 0,
+        Codec::F32 => 0,
+        Codec::F16 => 1,
+        Codec::Uniform { .. } => 2,
+        Codec::Sparse { .. } => 3,
+        Codec::Split { .. } => 4,
+        Codec::Block { .. } => 5,
+        Codec::Lattice { .. } => 6,
+        Codec::Gradient { .. } => 7,
+        Codec::Shared => 8,
+    };
+    1 << kind
+}
+
+/// What a shader does.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub(crate) enum Source {
+    /// The debug views.
+    Views,
+    /// The surface of a level set.
+    Surface,
+    /// The ray marcher.
+    March,
+    /// The path tracer.
+    Path,
+    /// From sums of light to a target.
+    Tone,
+    /// Small functions over many inputs, for tests.
+    #[cfg(test)]
+    Twins,
+}
+
+macro_rules! file {
+    ($name:literal) => {
+        include_str!(concat!("shader/", $name, ".wgsl"))
+    };
+}
+
+/// What all but [`Source::Tone`] begin with.
+const COMMON: [&str; 10] = [
+    file!("math"),
+    file!("hash"),
+    file!("phase"),
+    file!("color"),
+    file!("bindings"),
+    file!("tree"),
+    file!("block"),
+    file!("codec"),
+    file!("filter"),
+    file!("walk"),
+];
+
+impl Source {
+    /// The name of the entry point; of [`Source::Tone`] that of the fragment shader.
+    pub(crate) fn entry_point(self) -> &'static str {
+        match self {
+            Source::Views => "views",
+            Source::Surface => "surface",
+            Source::March => "march",
+            Source::Path => "path",
+            Source::Tone => "tone",
+            #[cfg(test)]
+            Source::Twins => "twins",
+        }
+    }
+
+    /// The whole text.
+    pub(crate) fn text(self, features: &Features) -> String {
+        let picture = "@group(1) @binding(1) var<storage, read_write> picture: array<vec4<f32>>;\n";
+        let mut text = prelude(features);
+        if self == Source::Tone {
+            text += "@group(1) @binding(1) var<storage, read> picture_read: array<vec4<f32>>;\n";
+            for part in [file!("math"), file!("phase"), file!("color"), file!("bindings"), file!("tone")] {
+                text += part;
+            }
+            return text;
+        }
+        text += picture;
+        text += &brick_words(features);
+        COMMON.iter().for_each(|part| text += part);
+        let end = if features.has_depth { file!("depth_end") } else { file!("open_end") };
+        let first_voxel = hdda(&Body {
+            name: "meet_voxel",
+            state: "VoxelHit",
+            layer: Layer::Voxel,
+            step: "let value = in_region(field, region, voxel);
+            if (value > 0.0 && is_active(field, voxel)) {
+                *state = VoxelHit(true, t0, voxel, value);
+                return;
+            }",
+            empty: "",
+        });
+        let own: &[&str] = match self {
+            Source::Views => &[file!("camera"), file!("cells"), file!("views"), &first_voxel],
+            Source::Surface => &[file!("camera"), file!("cells"), file!("surface")],
+            Source::March => &[file!("camera"), file!("emission"), end, file!("march")],
+            Source::Path => &[file!("camera"), file!("emission"), end, file!("light"), file!("path")],
+            Source::Tone => &[],
+            #[cfg(test)]
+            Source::Twins => &[file!("twins")],
+        };
+        own.iter().for_each(|part| text += part);
+        text
+    }
+}
+
+/// Down to which layer a walk goes by itself.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Layer {
+    /// A step for each brick.
+    #[cfg(test)]
+    Brick,
+    /// A step for each voxel of a brick.
+    Voxel,
+}
+
+/// What a walk does: WGSL that sees `field`, `ray`, `brick`, `region`, `voxel`, `t0`, `t1` and `state`.
+struct Body<'a> {
+    name: &'a str,
+    /// The type that `state` points to.
+    state: &'a str,
+    layer: Layer,
+    /// At each step; `return;` ends the walk.
+    step: &'a str,
+    /// In each empty region.
+    empty: &'a str,
+}
+
+/// A walk with its body put in, so that nothing is called.
+fn hdda(body: &Body<'_>) -> String {
+    let layer = match body.layer {
+        #[cfg(test)]
+        Layer::Brick => "BRICK_LAYER",
+        Layer::Voxel => "VOXEL_LAYER",
+    };
+    file!("hdda")
+        .replace("$NAME", body.name)
+        .replace("$STATE", body.state)
+        .replace("$LAYER", layer)
+        .replace("$STEP", body.step)
+        .replace("$EMPTY", body.empty)
+}
+
+/// Reads a word of the bricks, from whichever buffer holds it.
+fn brick_words(features: &Features) -> String {
+    let mut text = String::new();
+    for chunk in 0..features.chunks {
+        let _ = writeln!(
+            text,
+            "@group(0) @binding({}) var<storage, read> bricks_{chunk}: array<u32>;",
+            3 + chunk
+        );
+    }
+    text += "fn brick_word(at: u32) -> u32 {\n";
+    if features.chunks > 1 {
+        let shift = features.log2_chunk_words;
+        let _ =
+            writeln!(text, "    let within = at & ((1u << {shift}u) - 1u);\n    switch (at >> {shift}u) {{");
+        for chunk in 1..features.chunks {
+            let _ = writeln!(text, "        case {chunk}u: {{ return bricks_{chunk}[within]; }}");
+        }
+        text += "        default: { return bricks_0[within]; }\n    }\n}\n";
+    } else {
+        text += "    return bricks_0[at];\n}\n";
+    }
+    text
+}
+
+/// Where tables stand in the buffer of tables.
+pub(crate) mod tables {
+    use super::{Blackbody, bc7};
+
+    pub(crate) const BC7_MODES: usize = 0;
+    pub(crate) const BC7_WEIGHTS: usize = BC7_MODES + 10 * bc7::MODES.len();
+    /// Weights of indices of n bits begin at 2ⁿ.
+    pub(crate) const BC7_TWO_SUBSETS: usize = BC7_WEIGHTS + 32;
+    pub(crate) const BC7_THREE_SUBSETS: usize = BC7_TWO_SUBSETS + 64;
+    pub(crate) const BC7_TWO_ANCHOR: usize = BC7_THREE_SUBSETS + 64;
+    pub(crate) const BC7_THREE_SECOND_ANCHOR: usize = BC7_TWO_ANCHOR + 64;
+    pub(crate) const BC7_THREE_THIRD_ANCHOR: usize = BC7_THREE_SECOND_ANCHOR + 64;
+    pub(crate) const BLACKBODY: usize = BC7_THREE_THIRD_ANCHOR + 64;
+    pub(crate) const WORDS: usize = BLACKBODY + 4 * (Blackbody::STEPS + 1);
+
+    /// All tables but that of black bodies, which belongs to a scene.
+    pub(crate) fn words() -> Vec<u32> {
+        let mut words = Vec::with_capacity(WORDS);
+        for mode in &bc7::MODES {
+            words.extend([mode.subsets as u32, mode.partition, mode.rotation, mode.selection, mode.colour]);
+            words.extend([mode.alpha, mode.endpoint_low, mode.shared_low, mode.index, mode.second_index]);
+        }
+        words.extend([0; 4]);
+        words.extend(bc7::WEIGHTS_2.map(u32::from));
+        words.extend(bc7::WEIGHTS_3.map(u32::from));
+        words.extend(bc7::WEIGHTS_4.map(u32::from));
+        words.extend(bc7::TWO_SUBSETS.map(u32::from));
+        words.extend(bc7::THREE_SUBSETS);
+        for anchors in [bc7::TWO_ANCHOR, bc7::THREE_SECOND_ANCHOR, bc7::THREE_THIRD_ANCHOR] {
+            words.extend(anchors.map(u32::from));
+        }
+        words.resize(WORDS, 0);
+        words
+    }
+}
+
+/// Constants as WGSL has them.
+struct Prelude(String);
+
+impl Prelude {
+    fn u(&mut self, name: &str, value: impl TryInto<u32>) {
+        // What is printed here are small constants of this program.
+        let value = value.try_into().unwrap_or(u32::MAX);
+        let _ = writeln!(self.0, "const {name}: u32 = {value}u;");
+    }
+
+    fn i(&mut self, name: &str, value: i32) {
+        let _ = writeln!(self.0, "const {name}: i32 = {value};");
+    }
+
+    fn f(&mut self, name: &str, value: f32) {
+        let _ = writeln!(self.0, "const {name}: f32 = {value:e}f;");
+    }
+
+    fn b(&mut self, name: &str, value: bool) {
+        let _ = writeln!(self.0, "const {name}: bool = {value};");
+    }
+}
+
+fn prelude(features: &Features) -> String {
+    let mut p = Prelude(String::new());
+    p.u("WORKGROUP_SIDE", WORKGROUP_SIDE);
+    p.u("MAX_LIGHTS", MAX_LIGHTS);
+    p.f("MAX_F32", f32::MAX);
+    p.f("MIN_F32", f32::MIN_POSITIVE);
+    p.u("NONE", u32::MAX);
+
+    p.f("LOG2_E", std::f32::consts::LOG2_E);
+    p.f("PI", std::f32::consts::PI);
+    p.f("TAU", std::f32::consts::TAU);
+    p.f("LN_2_HIGH", math::LN_2_HIGH);
+    p.f("LN_2_LOW", math::LN_2_LOW);
+    p.f("EXP_LOWEST", math::EXP_LOWEST);
+    p.f("EXP_HIGHEST", math::EXP_HIGHEST);
+    p.f("OPAQUE_DEPTH", math::OPAQUE_DEPTH);
+    p.i("ROOT_HALF", math::ROOT_HALF);
+    let series = [("EXP", &math::EXP_SERIES[..]), ("SIN", &math::SIN_SERIES), ("COS", &math::COS_SERIES)];
+    for (name, terms) in series {
+        terms.iter().enumerate().for_each(|(i, term)| p.f(&format!("{name}_SERIES_{i}"), *term));
+    }
+    p.u("HASH_FIRST", hash::HASH_FACTORS[0]);
+    p.u("HASH_SECOND", hash::HASH_FACTORS[1]);
+    p.u("GOLDEN", hash::GOLDEN);
+    p.f("UNIT_STEP", hash::UNIT_STEP);
+    p.u("PLASTIC_X", hash::PLASTIC_STEPS[0]);
+    p.u("PLASTIC_Y", hash::PLASTIC_STEPS[1]);
+
+    p.f("MAX_ASYMMETRY", phase::MAX_ASYMMETRY);
+    p.f("MAX_ALPHA", phase::MAX_ALPHA);
+    p.f("DRAINE_TOLERANCE", phase::TOLERANCE);
+    p.u("DRAINE_MAX_STEPS", phase::MAX_STEPS);
+    p.f("SRGB_LINEAR_END", color::SRGB_LINEAR_END);
+    p.f("COLDEST_KELVIN", Blackbody::COLDEST_KELVIN);
+    p.f("HOTTEST_KELVIN", Blackbody::HOTTEST_KELVIN);
+    p.f("BLACKBODY_STEPS", Blackbody::STEPS as f32);
+
+    p.u("LOG2_BRICK", LOG2_BRICK);
+    p.u("LOG2_NODE4_BRICKS", LOG2_NODE4_BRICKS);
+    p.u("LOG2_NODE5_BRICKS", LOG2_NODE5_BRICKS);
+    p.i("NODE5_BRICKS", 1 << LOG2_NODE5_BRICKS);
+    p.f("BRICK_SIDE", (1 << LOG2_BRICK) as f32);
+    p.f("NODE5_SIDE", (1 << (LOG2_NODE5_BRICKS + LOG2_BRICK)) as f32);
+    p.u("NODE4_SUMMARY_WORDS", NODE4_SLOTS / 1024);
+    p.u("NODE5_SUMMARY_WORDS", NODE5_SLOTS / 1024);
+    p.u("CELL_WORDS", size_of::<RootCell>() / 4);
+    for (i, name) in
+        ["CELLS", "NODE5S", "NODE4S", "ENTRIES", "MASKS", "SHAPES", "FIELDS_PER_FRAME"].iter().enumerate()
+    {
+        p.u(name, i);
+    }
+    p.u("ABSENT_TAG", ABSENT_TAG);
+    p.u("NODE_TAG", Entry::NODE);
+    p.u("CONSTANT_TAG", Codec::Constant.tag());
+    p.u("BOUND_SIGN", bounds::SIGN);
+    p.u("BOUND_EXPONENT_OFFSET", bounds::EXPONENT_OFFSET);
+    p.u("BOUND_DROPPED_BITS", bounds::DROPPED_BITS);
+    p.u("BRICK_LAYER", 1u32);
+    p.u("VOXEL_LAYER", 0u32);
+
+    p.f("HALF_SUBNORMAL_STEP", f32_from_finite_f16(1));
+    p.u("LAST_UNIFORM_TAG", Codec::Uniform { bits: 8 }.tag());
+    p.u("F16_TAG", Codec::F16.tag());
+    p.u("F32_TAG", Codec::F32.tag());
+    p.u("SHARED_TAG", Codec::Shared.tag());
+    p.u("FIRST_GRADIENT_TAG", Codec::Gradient { bits: 0 }.tag());
+    p.u("FIRST_LATTICE_TAG", Codec::Lattice { bits: 0 }.tag());
+    p.u("FIRST_BLOCK_TAG", Codec::Block { format: BlockFormat::Bc4, axis: PackingAxis::X }.tag());
+    p.u("FIRST_SPLIT_TAG", Codec::Split { bits: 1 }.tag());
+    p.u("FIRST_SPARSE_TAG", codec::SPARSE_TAG);
+    p.u("FIRST_FITTED_TAG", codec::SPARSE_FITTED_TAG);
+    p.u("SPARSE_BENT", sparse::BENT);
+    p.u("SPARSE_HAS_ENDS", sparse::HAS_ENDS);
+    p.f("SPARSE_LAST_END", sparse::LAST_END);
+    CODEC_KINDS
+        .iter()
+        .enumerate()
+        .for_each(|(i, name)| p.b(&format!("HAS_{name}"), features.codecs >> i & 1 == 1));
+    p.u("BC7_MODES", tables::BC7_MODES);
+    p.u("BC7_WEIGHTS", tables::BC7_WEIGHTS);
+    p.u("BC7_TWO_SUBSETS", tables::BC7_TWO_SUBSETS);
+    p.u("BC7_THREE_SUBSETS", tables::BC7_THREE_SUBSETS);
+    p.u("BC7_TWO_ANCHOR", tables::BC7_TWO_ANCHOR);
+    p.u("BC7_THREE_SECOND_ANCHOR", tables::BC7_THREE_SECOND_ANCHOR);
+    p.u("BC7_THREE_THIRD_ANCHOR", tables::BC7_THREE_THIRD_ANCHOR);
+    p.u("BLACKBODY", tables::BLACKBODY);
+
+    p.u("MAX_ROOT_LEAPS", traverse::MAX_ROOT_LEAPS);
+    p.i("MAX_ROOT_LEAP", traverse::MAX_ROOT_LEAP as i32);
+    p.u("MOST_REFINEMENTS", surface::MOST_REFINEMENTS);
+    // Gauss' rule of two points, and a part of a brick that tells which side of a face a ray goes to.
+    p.f("GAUSS_NODE", 1.0 / 3.0_f32.sqrt());
+    p.f("GAUSS_NUDGE", 1e-5);
+    p.f("LIT_PIECE_DEPTH", march::LIT_PIECE_DEPTH);
+    p.f("LIT_PIECE_VOXELS", march::LIT_PIECE_VOXELS);
+    p.f("GROUP_VOXELS", march::GROUP_VOXELS);
+    p.f("FAINT_GROUP", march::FAINT_GROUP);
+    p.f("FAINT_GROUP_VOXELS", march::FAINT_GROUP_VOXELS);
+    p.u("SKY_SEED", march::SKY_SEEDS[0]);
+    p.u("SKY_DIRECTION_SEED", march::SKY_SEEDS[1]);
+    p.f("ROULETTE_WEIGHT", path::ROULETTE_WEIGHT);
+    p.f("ROULETTE_TRANSMITTANCE", path::ROULETTE_TRANSMITTANCE);
+    p.f("OPAQUE", path::OPAQUE);
+
+    p.u("LIGHT_SUN", params::LIGHT_SUN);
+    p.u("LIGHT_SPOT", params::LIGHT_SPOT);
+    p.u("LIGHT_SPHERE", params::LIGHT_SPHERE);
+    p.u("DENSITY_CHANNEL", 0u32);
+    p.u("GLOW_CHANNEL", features.glow_channel.unwrap_or(0));
+    p.b("HAS_EMISSION", features.glow_channel.is_some());
+    p.b("IS_GREY", features.is_grey);
+    p.b("ENCODES_SRGB", features.encodes_srgb);
+    for (i, name) in
+        ["VIEW_DENSITY", "VIEW_DEPTH", "VIEW_INDEX", "VIEW_FIRST_DENSITY", "VIEW_HITS"].iter().enumerate()
+    {
+        p.u(name, i);
+    }
+    p.0
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use naga::valid::{Capabilities, ValidationFlags, Validator};
+
+    fn validate(text: &str) {
+        let module = naga::front::wgsl::parse_str(text)
+            .unwrap_or_else(|error| panic!("{}", error.emit_to_string(text)));
+        // With no capability beyond those of WebGPU.
+        let mut validator = Validator::new(ValidationFlags::all(), Capabilities::empty());
+        validator.validate(&module).unwrap_or_else(|error| panic!("{}", error.emit_to_string(text)));
+    }
+
+    #[test]
+    fn every_entry_point_is_valid() {
+        let sources =
+            [Source::Views, Source::Surface, Source::March, Source::Path, Source::Tone, Source::Twins];
+        let bare = Features { codecs: 0, chunks: 1, glow_channel: None, is_grey: true, ..Features::ALL };
+        for features in [Features::ALL, bare, Features { has_depth: true, chunks: 4, ..Features::ALL }] {
+            for source in sources {
+                let text = source.text(&features);
+                validate(&text);
+                assert!(text.contains(&format!("fn {}(", source.entry_point())), "{source:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn walks_take_any_body() {
+        let body = Body {
+            name: "count",
+            state: "vec2<u32>",
+            layer: Layer::Brick,
+            step: "(*state).x += 1u;",
+            empty: "(*state).y += 1u;",
+        };
+        let all = Features::ALL;
+        validate(&(Source::Views.text(&all) + &hdda(&body)));
+    }
+
+    #[test]
+    fn tables_are_as_long_as_they_say() {
+        let words = tables::words();
+        assert_eq!(words[tables::BC7_WEIGHTS + 4], 0);
+        assert_eq!(words[tables::BC7_WEIGHTS + 31], 64);
+        assert_eq!(words[tables::BC7_TWO_SUBSETS], u32::from(bc7::TWO_SUBSETS[0]));
+        assert_eq!(words[tables::BLACKBODY - 1], u32::from(bc7::THREE_THIRD_ANCHOR[63]));
+    }
+}

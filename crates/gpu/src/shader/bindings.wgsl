@@ -1,0 +1,76 @@
+// What passes read and write. Structures have the layout of their twins in Rust (`crate::params`).
+
+struct Field {
+    // Columns of the matrix that takes directions of the world to positions of the field.
+    x_axis: vec4<f32>,
+    y_axis: vec4<f32>,
+    z_axis: vec4<f32>,
+    // The position of the volume's origin; then the unit of half floats in bricks.
+    origin: vec4<f32>,
+    // Where samples can be other than 0; then the unit of bounds, and the smallest value.
+    bounds_min: vec4<f32>,
+    bounds_max: vec4<f32>,
+    // The brick that positions count from; then the first root cell.
+    base_brick: vec4<i32>,
+    // The first and the last brick that matter; then, in the first, the count of root cells.
+    box_first: vec4<i32>,
+    box_last: vec4<i32>,
+    // The first and the last active voxel.
+    active_min: vec4<i32>,
+    active_max: vec4<i32>,
+    // What values mean: scale, bias, and the largest.
+    value: vec4<f32>,
+    // What is added to an index for the source's.
+    index_offset: vec4<i32>,
+}
+
+struct Light {
+    // A direction to it, or its place; then its kind.
+    place: vec4<f32>,
+    // Irradiance, intensity or radiance; then a cone's spread, the cosine of the inner angle, or the radius.
+    colour: vec4<f32>,
+    // Where a spot shines; then the cosine of the outer angle.
+    aim: vec4<f32>,
+}
+
+struct Params {
+    camera: vec4<f32>,
+    forward: vec4<f32>,
+    right: vec4<f32>,
+    up: vec4<f32>,
+    // Width, height, frame, first sample.
+    size: vec4<u32>,
+    // Samples, most scatterings, what a view shows, lights.
+    counts: vec4<u32>,
+    // Extinction of the three colours, and the largest of them.
+    extinction: vec4<f32>,
+    albedo: vec4<f32>,
+    phase: Phase,
+    // Radiance per value, then -1; or a black body's scale in the first, then kelvin per unit.
+    emission: vec4<f32>,
+    sky_up: vec4<f32>,
+    sky_zenith: vec4<f32>,
+    sky_horizon: vec4<f32>,
+    sky_ground: vec4<f32>,
+    // Step of camera rays and of shadow rays in voxels, growth, least transmittance.
+    march: vec4<f32>,
+    // Rays to the sun and to the sky, the depth at which shadow rays end.
+    march_rays: vec4<f32>,
+    sun_direction: vec4<f32>,
+    sun_irradiance: vec4<f32>,
+    // The nearest and the furthest distance, the largest value, the surface's level.
+    view: vec4<f32>,
+    // Exposure, one over the samples, pixels of the picture per pixel of the target.
+    tone: vec4<f32>,
+    // Columns of what takes the host's clip space to the world.
+    clip_x: vec4<f32>,
+    clip_y: vec4<f32>,
+    clip_z: vec4<f32>,
+    clip_w: vec4<f32>,
+    lights: array<Light, MAX_LIGHTS>,
+}
+
+@group(0) @binding(0) var<storage, read> tree: array<u32>;
+@group(0) @binding(1) var<storage, read> fields: array<Field>;
+@group(0) @binding(2) var<storage, read> tables: array<u32>;
+@group(1) @binding(0) var<uniform> params: Params;

@@ -1,0 +1,28 @@
+// Rays through pixels: nuage_render::camera.
+
+fn camera_ray(pixel: vec2<f32>) -> Ray {
+    let size = vec2<f32>(params.size.xy);
+    let x = (2.0 * pixel.x - size.x) / size.x;
+    let y = (size.y - 2.0 * pixel.y) / size.x;
+    let direction = params.forward.xyz + x * params.right.xyz + y * params.up.xyz;
+    return Ray(params.camera.xyz, normalize(direction));
+}
+
+// A ray in a field's positions, beginning where it begins in the world.
+fn in_field(field: u32, ray: Ray) -> LocalRay {
+    return local_ray(position_of(field, ray.origin), directions(field, ray.direction));
+}
+
+// The same ray with t = 0 moved to a distance.
+fn moved(field: u32, ray: Ray, start: f32) -> LocalRay {
+    return local_ray(position_of(field, ray.origin + ray.direction * start), directions(field, ray.direction));
+}
+
+// The field of a channel in the frame that is shown.
+fn field_of(channel: u32) -> u32 {
+    return params.size.z * tree[FIELDS_PER_FRAME] + channel;
+}
+
+fn store(pixel: vec2<u32>, value: vec4<f32>) {
+    picture[pixel.y * params.size.x + pixel.x] = value;
+}

@@ -1,0 +1,305 @@
+// The walk of a ray through a tree: nuage_render::traverse.
+
+// A ray in the world, which here begins at the volume's origin.
+struct Ray { origin: vec3<f32>, direction: vec3<f32> }
+
+// A ray in the positions of a field, and one over its direction.
+struct LocalRay { origin: vec3<f32>, direction: vec3<f32>, inverse: vec3<f32> }
+
+fn local_ray(origin: vec3<f32>, direction: vec3<f32>) -> LocalRay {
+    let is_still = direction == vec3<f32>(0.0);
+    let inverse = select(1.0 / select(direction, vec3<f32>(1.0), is_still), vec3<f32>(0.0), is_still);
+    return LocalRay(origin, direction, inverse);
+}
+
+fn ray_at(ray: LocalRay, t: f32) -> vec3<f32> {
+    return ray.origin + ray.direction * t;
+}
+
+fn directions(field: u32, direction: vec3<f32>) -> vec3<f32> {
+    return fields[field].x_axis.xyz * direction.x + fields[field].y_axis.xyz * direction.y
+        + fields[field].z_axis.xyz * direction.z;
+}
+
+fn position_of(field: u32, p_world: vec3<f32>) -> vec3<f32> {
+    return directions(field, p_world) + fields[field].origin.xyz;
+}
+
+// Where a ray is inside of a box, from 0 on; empty if it misses.
+fn interval_in(ray: LocalRay, low: vec3<f32>, high: vec3<f32>) -> vec2<f32> {
+    let a = (low - ray.origin) * ray.inverse;
+    let b = (high - ray.origin) * ray.inverse;
+    let is_still = ray.direction == vec3<f32>(0.0);
+    let is_outside = is_still & ((ray.origin < low) | (ray.origin > high));
+    let near = select(min(a, b), vec3<f32>(0.0), is_still);
+    let far = select(max(a, b), vec3<f32>(MAX_F32), is_still);
+    if (any(is_outside)) {
+        return vec2<f32>(0.0, 0.0);
+    }
+    return vec2<f32>(max(max_component(near), 0.0), min_component(far));
+}
+
+// Where a ray enters and leaves a field; empty if it misses. A shift moves the field's bounds, in voxels.
+fn field_interval(field: u32, ray: LocalRay, shift: f32) -> vec2<f32> {
+    if (fields[field].box_first.w == 0) {
+        return vec2<f32>(0.0, 0.0);
+    }
+    return interval_in(ray, fields[field].bounds_min.xyz - shift, fields[field].bounds_max.xyz - shift);
+}
+
+// Where a ray that starts inside leaves the field.
+fn field_exit(field: u32, ray: LocalRay) -> f32 {
+    let far = select(fields[field].bounds_min.xyz, fields[field].bounds_max.xyz, ray.direction >= vec3<f32>(0.0));
+    let t = (far - ray.origin) * ray.inverse;
+    return min_component(select(t, vec3<f32>(MAX_F32), ray.direction == vec3<f32>(0.0)));
+}
+
+// A stretch of a ray: of one value, or to be sampled.
+struct Run { t0: f32, t1: f32, is_varying: bool, value: f32 }
+
+struct Runs {
+    field: u32,
+    ray: LocalRay,
+    // The brick to look at next, in the tree, and where the ray enters it.
+    brick: vec3<i32>,
+    t: f32,
+    t_end: f32,
+    // Where the ray leaves that brick along each axis, and the distance between its faces.
+    t_next: vec3<f32>,
+    t_brick: vec3<f32>,
+    sign: vec3<i32>,
+    brick_end: vec3<i32>,
+    root_leaps_left: u32,
+    // What was found and not yet given out: a varying run, one of a value, and a varying one, between these four
+    // distances; and how many of them are given out.
+    cuts: vec4<f32>,
+    value: f32,
+    given: u32,
+}
+
+fn faces_at(runs: ptr<function, Runs>, brick: vec3<i32>) -> vec3<f32> {
+    let ray = (*runs).ray;
+    let t = (vec3<f32>(brick - fields[(*runs).field].base_brick.xyz) * BRICK_SIDE - ray.origin) * ray.inverse;
+    return select(t, vec3<f32>(MAX_F32), ray.direction == vec3<f32>(0.0));
+}
+
+fn aim(runs: ptr<function, Runs>) {
+    let forward = (*runs).ray.direction >= vec3<f32>(0.0);
+    (*runs).t_next = faces_at(runs, select((*runs).brick, (*runs).brick + 1, forward));
+}
+
+fn brick_of_position(field: u32, position: vec3<f32>) -> vec3<i32> {
+    return vec3<i32>(floor(position / BRICK_SIDE)) + fields[field].base_brick.xyz;
+}
+
+// The runs of a ray between two distances inside the field.
+fn runs_between(field: u32, ray: LocalRay, t0: f32, t1: f32) -> Runs {
+    let forward = ray.direction >= vec3<f32>(0.0);
+    let box_first = fields[field].box_first.xyz;
+    let box_last = fields[field].box_last.xyz;
+    var runs: Runs;
+    runs.field = field;
+    runs.ray = ray;
+    runs.brick = clamp(brick_of_position(field, ray_at(ray, t0)), box_first, box_last);
+    runs.t = t0;
+    runs.t_end = t1;
+    runs.t_brick = abs(BRICK_SIDE * ray.inverse);
+    runs.sign = select(vec3<i32>(-1), vec3<i32>(1), forward);
+    runs.brick_end = select(box_first - 1, box_last + 1, forward);
+    runs.root_leaps_left = MAX_ROOT_LEAPS;
+    runs.given = 3u;
+    aim(&runs);
+    return runs;
+}
+
+// Moves on to the next brick.
+fn step_brick(runs: ptr<function, Runs>) {
+    let next = (*runs).t_next;
+    var axis = vec3<i32>(0, 0, 1);
+    if (next.x <= next.y && next.x <= next.z) {
+        axis = vec3<i32>(1, 0, 0);
+    } else if (next.y <= next.z) {
+        axis = vec3<i32>(0, 1, 0);
+    }
+    (*runs).t = max((*runs).t, min_component(next));
+    (*runs).t_next = next + select(vec3<f32>(0.0), (*runs).t_brick, axis == vec3<i32>(1));
+    (*runs).brick += axis * (*runs).sign;
+    if (any((axis == vec3<i32>(1)) & ((*runs).brick == (*runs).brick_end))) {
+        (*runs).t_end = min((*runs).t_end, (*runs).t);
+    }
+}
+
+// Moves on to where the ray leaves the cube of bricks around the one it is in, and to the brick behind.
+fn leap(runs: ptr<function, Runs>, log2_bricks: u32) {
+    let ray = (*runs).ray;
+    let field = (*runs).field;
+    let first = (*runs).brick & vec3<i32>(-1 << log2_bricks);
+    let last = first + ((1 << log2_bricks) - 1);
+    let forward = ray.direction >= vec3<f32>(0.0);
+    let faces = faces_at(runs, select(first, last + 1, forward));
+    var axis = vec3<bool>(false, false, true);
+    if (faces.x <= faces.y && faces.x <= faces.z) {
+        axis = vec3<bool>(true, false, false);
+    } else if (faces.y <= faces.z) {
+        axis = vec3<bool>(false, true, false);
+    }
+    (*runs).t = max((*runs).t, min_component(faces));
+    let box_first = fields[field].box_first.xyz;
+    let box_last = fields[field].box_last.xyz;
+    let within = clamp(
+        brick_of_position(field, ray_at(ray, (*runs).t)), max(first, box_first), min(last, box_last),
+    );
+    // The axis of the exit moves by the integers, so that the walk never stands still.
+    (*runs).brick = select(within, select(first - 1, last + 1, forward), axis);
+    if (any((*runs).brick < box_first) || any((*runs).brick > box_last)) {
+        (*runs).t_end = min((*runs).t_end, (*runs).t);
+    }
+    aim(runs);
+}
+
+// Moves on to the next cell of the root table, over all that have none.
+fn leap_to_root_entry(runs: ptr<function, Runs>) {
+    let field = (*runs).field;
+    let count = fields[field].box_first.w;
+    if (count > MAX_ROOT_LEAP || (*runs).root_leaps_left == 0u) {
+        return;
+    }
+    (*runs).root_leaps_left -= 1u;
+    var next = MAX_F32;
+    var next_first = vec3<i32>(0);
+    for (var i = 0; i < count; i++) {
+        let first = cell_at(u32(fields[field].base_brick.w + i)) << vec3<u32>(LOG2_NODE5_BRICKS);
+        let low = vec3<f32>(first - fields[field].base_brick.xyz) * BRICK_SIDE;
+        let inside = interval_in((*runs).ray, low, low + NODE5_SIDE);
+        let t0 = max(inside.x, (*runs).t);
+        if (t0 < inside.y && t0 < next) {
+            next = t0;
+            next_first = first;
+        }
+    }
+    if (next == MAX_F32) {
+        (*runs).t_end = min((*runs).t_end, (*runs).t);
+        return;
+    }
+    (*runs).t = next;
+    let first = max(next_first, fields[field].box_first.xyz);
+    let last = min(next_first + (NODE5_BRICKS - 1), fields[field].box_last.xyz);
+    if (any(first > last)) {
+        return;
+    }
+    (*runs).brick = clamp(brick_of_position(field, ray_at((*runs).ray, next)), first, last);
+    aim(runs);
+}
+
+fn pass_region(runs: ptr<function, Runs>, log2_bricks: u32) {
+    if (log2_bricks == 0u) {
+        step_brick(runs);
+    } else {
+        leap(runs, log2_bricks);
+    }
+}
+
+// A stretch of a ray through one region, with bounds of all that can be sampled there.
+struct Segment { is_there: bool, t0: f32, t1: f32, min: f32, max: f32 }
+
+// The next region that is not empty. To be used instead of `next_run`.
+fn next_segment(runs: ptr<function, Runs>, accessor: ptr<function, Accessor>) -> Segment {
+    while ((*runs).t < (*runs).t_end) {
+        let brick = (*runs).brick;
+        let region = region_at((*runs).field, accessor, brick);
+        let bounds = footprint((*runs).field, brick, region);
+        let t0 = (*runs).t;
+        pass_region(runs, region.log2_bricks);
+        let t1 = min((*runs).t, (*runs).t_end);
+        if (bounds.y > 0.0 && t0 < t1) {
+            return Segment(true, t0, t1, bounds.x, bounds.y);
+        }
+        if (bounds.y <= 0.0 && region.log2_bricks == LOG2_NODE5_BRICKS) {
+            leap_to_root_entry(runs);
+        }
+    }
+    return Segment(false, 0.0, 0.0, 0.0, 0.0);
+}
+
+// Cuts the stretch of a large tile at its homogeneous part.
+fn split_tile(runs: ptr<function, Runs>, brick: vec3<i32>, region: Region, t0: f32, t1: f32) {
+    let field = (*runs).field;
+    let first = brick & vec3<i32>(-1 << region.log2_bricks);
+    let low = vec3<f32>(first - fields[field].base_brick.xyz) * BRICK_SIDE;
+    let side = f32(1u << (region.log2_bricks + LOG2_BRICK));
+    let inside = interval_in((*runs).ray, low, low + (side - 1.0));
+    var core = vec2<f32>(t1, t1);
+    if (inside.x < inside.y) {
+        core = clamp(inside, vec2<f32>(t0), vec2<f32>(t1));
+    }
+    // Only bricks are not of one value, and they are no tiles.
+    wait_with(runs, vec4<f32>(t0, core, t1), meant(field, bitcast<f32>(region.entry.payload)));
+}
+
+// A run that may not be there.
+struct FoundRun { is_there: bool, run: Run }
+
+fn wait_with(runs: ptr<function, Runs>, cuts: vec4<f32>, value: f32) {
+    (*runs).cuts = cuts;
+    (*runs).value = value;
+    (*runs).given = 0u;
+}
+
+fn waiting_run(runs: ptr<function, Runs>) -> FoundRun {
+    let cuts = (*runs).cuts;
+    while ((*runs).given < 3u) {
+        let number = (*runs).given;
+        (*runs).given += 1u;
+        let t0 = select(select(cuts.z, cuts.y, number == 1u), cuts.x, number == 0u);
+        let t1 = select(select(cuts.w, cuts.z, number == 1u), cuts.y, number == 0u);
+        let is_varying = number != 1u;
+        if (t0 < t1 && (is_varying || (*runs).value != 0.0)) {
+            return FoundRun(true, Run(t0, t1, is_varying, select((*runs).value, 0.0, is_varying)));
+        }
+    }
+    return FoundRun(false, Run(0.0, 0.0, false, 0.0));
+}
+
+// The next run. Varying bricks that touch come as one.
+fn next_run(runs: ptr<function, Runs>, accessor: ptr<function, Accessor>) -> FoundRun {
+    let waiting = waiting_run(runs);
+    if (waiting.is_there) {
+        return waiting;
+    }
+    var joined = FoundRun(false, Run(0.0, 0.0, true, 0.0));
+    while ((*runs).t < (*runs).t_end) {
+        let brick = (*runs).brick;
+        let region = region_at((*runs).field, accessor, brick);
+        let bounds = footprint((*runs).field, brick, region);
+        let t0 = (*runs).t;
+        pass_region(runs, region.log2_bricks);
+        let t1 = min((*runs).t, (*runs).t_end);
+        if (t0 >= t1) {
+            continue;
+        }
+        if (bounds.x == bounds.y) {
+            if (bounds.y == 0.0) {
+                if (region.log2_bricks == LOG2_NODE5_BRICKS) {
+                    leap_to_root_entry(runs);
+                }
+                if (joined.is_there) {
+                    break;
+                }
+                continue;
+            }
+            wait_with(runs, vec4<f32>(t0, t0, t1, t1), bounds.y);
+        } else if (region.log2_bricks == 0u) {
+            joined = FoundRun(true, Run(select(t0, joined.run.t0, joined.is_there), t1, true, 0.0));
+            continue;
+        } else {
+            split_tile(runs, brick, region, t0, t1);
+        }
+        if (joined.is_there || (*runs).given < 3u) {
+            break;
+        }
+    }
+    if (joined.is_there) {
+        return joined;
+    }
+    return waiting_run(runs);
+}

@@ -1,0 +1,214 @@
+//! A volume on a device: the buffers of its trees and bricks, and what binds them.
+//!
+//! Trees stand in one buffer, fields in another, bricks in as many as the device's limit of a binding asks for.
+//! All frames are there at once: which one is shown is a number that passes are told.
+
+use glam::DVec3;
+
+use crate::arrays::Arrays;
+use crate::device::Gpu;
+use crate::error::GpuError;
+use crate::params::Place;
+use crate::shader::tables;
+
+/// The most buffers of bricks: with what else a pass reads, as many storage buffers as WebGPU promises.
+const MAX_CHUNKS: u64 = 4;
+
+/// A volume on a device.
+#[derive(Debug)]
+pub struct Volume {
+    layout: wgpu::BindGroupLayout,
+    bind_group: wgpu::BindGroup,
+    tables: wgpu::Buffer,
+    arrays: Summary,
+    chunks: u32,
+    log2_chunk_words: u32,
+    size_bytes: SizeBytes,
+}
+
+/// What is still wanted of the arrays once their words are on the device.
+#[derive(Debug)]
+struct Summary {
+    origin: DVec3,
+    codecs: u32,
+    frames: usize,
+    channels: usize,
+    largest: Vec<f32>,
+    /// Of the first channel.
+    places: Vec<Option<Place>>,
+}
+
+/// The memory that a volume takes on its device.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SizeBytes {
+    /// Nodes, masks and entries.
+    pub trees: u64,
+    /// Bricks and shapes.
+    pub bricks: u64,
+    /// Fields and tables.
+    pub tables: u64,
+}
+
+impl Volume {
+    /// Copies the words of a volume to a device.
+    ///
+    /// # Errors
+    /// If they exceed what the device takes, or it fails.
+    pub fn new(gpu: &Gpu, arrays: &Arrays) -> Result<Volume, GpuError> {
+        let limits = gpu.device().limits();
+        let binding = limits.max_storage_buffer_binding_size.min(limits.max_buffer_size);
+        let storage = wgpu::BufferUsages::STORAGE;
+        let within = |what, size_bytes: u64, limit_bytes| match size_bytes <= limit_bytes {
+            true => Ok(()),
+            false => Err(GpuError::Limit { what, size_bytes, limit_bytes }),
+        };
+        let tree_words = arrays.tree_words();
+        within("a tree", size_of_val(tree_words.as_slice()) as u64, binding)?;
+        let tree = gpu.buffer("nuage tree", bytemuck::cast_slice(&tree_words), storage)?;
+        let fields = arrays.fields();
+        within("a table of frames", size_of_val(fields.as_slice()) as u64, binding)?;
+        let fields_buffer = gpu.buffer("nuage fields", bytemuck::cast_slice(&fields), storage)?;
+        let table_words = tables::words();
+        let tables = gpu.buffer("nuage tables", bytemuck::cast_slice(&table_words), storage)?;
+
+        let [bricks, shapes] = arrays.brick_words();
+        let log2_chunk_words = (binding / 4).clamp(1, 1 << 31).ilog2();
+        let chunk_words = 1_usize << log2_chunk_words;
+        let count = bricks.len() + shapes.len();
+        within("the bricks of a volume", 4 * count as u64, MAX_CHUNKS * 4 * chunk_words as u64)?;
+        let chunks = count.div_ceil(chunk_words).max(1);
+        let mut buffers = Vec::with_capacity(chunks);
+        for chunk in 0..chunks {
+            let first = chunk * chunk_words;
+            let words = chunk_words.min(count - first).max(1);
+            let buffer =
+                gpu.empty_buffer("nuage bricks", 4 * words as u64, storage | wgpu::BufferUsages::COPY_DST)?;
+            // What of bricks and of shapes falls into this buffer.
+            for (words_before, part) in [(0, bricks), (bricks.len(), shapes)] {
+                let begin = first.max(words_before);
+                let end = (first + words).min(words_before + part.len());
+                if begin < end {
+                    let words = &part[begin - words_before..end - words_before];
+                    let at = 4 * (begin - first) as u64;
+                    gpu.guarded(|| gpu.queue().write_buffer(&buffer, at, bytemuck::cast_slice(words)))?;
+                }
+            }
+            buffers.push(buffer);
+        }
+
+        let all: Vec<&wgpu::Buffer> = [&tree, &fields_buffer, &tables].into_iter().chain(&buffers).collect();
+        let entry = |binding: usize| storage_entry(binding as u32, true, wgpu::ShaderStages::COMPUTE);
+        let entries: Vec<_> = (0..all.len()).map(entry).collect();
+        let descriptor = wgpu::BindGroupLayoutDescriptor { label: Some("nuage volume"), entries: &entries };
+        let layout = gpu.guarded(|| gpu.device().create_bind_group_layout(&descriptor))?;
+        let bind_group = bind(gpu, "nuage volume", &layout, &all)?;
+        let channels = arrays.channels();
+        Ok(Volume {
+            layout,
+            bind_group,
+            tables,
+            arrays: Summary {
+                origin: arrays.origin(),
+                codecs: arrays.codecs(),
+                frames: arrays.frames(),
+                channels,
+                largest: (0..channels).map(|channel| arrays.largest(channel)).collect(),
+                places: (0..arrays.frames()).map(|frame| arrays.place(frame, 0).copied()).collect(),
+            },
+            chunks: chunks as u32,
+            log2_chunk_words,
+            size_bytes: SizeBytes {
+                trees: tree.size(),
+                bricks: buffers.iter().map(wgpu::Buffer::size).sum(),
+                tables: fields_buffer.size() + 4 * table_words.len() as u64,
+            },
+        })
+    }
+
+    /// How many frames there are.
+    pub fn frames(&self) -> usize {
+        self.arrays.frames
+    }
+
+    /// How many channels each frame has.
+    pub fn channels(&self) -> usize {
+        self.arrays.channels
+    }
+
+    /// The memory taken on the device.
+    pub fn size_bytes(&self) -> SizeBytes {
+        self.size_bytes
+    }
+
+    pub(crate) fn layout(&self) -> &wgpu::BindGroupLayout {
+        &self.layout
+    }
+
+    pub(crate) fn bind_group(&self) -> &wgpu::BindGroup {
+        &self.bind_group
+    }
+
+    pub(crate) fn tables(&self) -> &wgpu::Buffer {
+        &self.tables
+    }
+
+    /// Where the world of shaders begins.
+    pub(crate) fn origin(&self) -> DVec3 {
+        self.arrays.origin
+    }
+
+    pub(crate) fn codecs(&self) -> u32 {
+        self.arrays.codecs
+    }
+
+    /// How many buffers hold bricks, and log2 of the words of each.
+    pub(crate) fn chunks(&self) -> (u32, u32) {
+        (self.chunks, self.log2_chunk_words)
+    }
+
+    /// The largest value of the first channel.
+    pub(crate) fn largest(&self) -> f32 {
+        self.arrays.largest.first().copied().unwrap_or(0.0)
+    }
+
+    /// Where the first channel is in a frame.
+    pub(crate) fn place(&self, frame: usize) -> Option<&Place> {
+        self.arrays.places.get(frame)?.as_ref()
+    }
+}
+
+/// A binding of a storage buffer.
+pub(crate) fn storage_entry(
+    binding: u32,
+    read_only: bool,
+    visibility: wgpu::ShaderStages,
+) -> wgpu::BindGroupLayoutEntry {
+    buffer_entry(binding, visibility, wgpu::BufferBindingType::Storage { read_only })
+}
+
+/// A binding of a buffer.
+pub(crate) fn buffer_entry(
+    binding: u32,
+    visibility: wgpu::ShaderStages,
+    ty: wgpu::BufferBindingType,
+) -> wgpu::BindGroupLayoutEntry {
+    let ty = wgpu::BindingType::Buffer { ty, has_dynamic_offset: false, min_binding_size: None };
+    wgpu::BindGroupLayoutEntry { binding, visibility, ty, count: None }
+}
+
+/// Binds whole buffers in order.
+///
+/// # Errors
+/// If the device fails.
+pub(crate) fn bind(
+    gpu: &Gpu,
+    label: &str,
+    layout: &wgpu::BindGroupLayout,
+    buffers: &[&wgpu::Buffer],
+) -> Result<wgpu::BindGroup, GpuError> {
+    let resources = buffers.iter().map(|buffer| buffer.as_entire_binding());
+    let entries: Vec<_> =
+        (0..).zip(resources).map(|(binding, resource)| wgpu::BindGroupEntry { binding, resource }).collect();
+    let descriptor = wgpu::BindGroupDescriptor { label: Some(label), layout, entries: &entries };
+    gpu.guarded(|| gpu.device().create_bind_group(&descriptor))
+}

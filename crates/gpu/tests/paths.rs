@@ -1,0 +1,179 @@
+//! The path tracer of the GPU held to that of the CPU: both are estimates, so blocks of pixels are compared in standard
+//! errors.
+
+#![allow(clippy::print_stdout, reason = "the measured errors are worth reading")]
+
+mod common;
+
+use common::{bent, channel_of, cloud, gpu, lit, uploaded};
+use glam::{IVec3, Vec3};
+use nuage_gpu::device::Gpu;
+use nuage_gpu::look::{Look, Pass};
+use nuage_gpu::renderer::Renderer;
+use nuage_gpu::upload::Volume as GpuVolume;
+use nuage_render::film::Film;
+use nuage_render::framing::WorldBox;
+use nuage_render::light::{Light, Sky, Spot, Sun};
+use nuage_render::path::PathSettings;
+use nuage_render::progressive::{Plan, Watch, trace};
+use nuage_render::scene::{Emission, Phase, Scene, Spectrum};
+use nuage_testkit::blocks::Estimate;
+
+const WIDTH: u32 = 48;
+const HEIGHT: u32 = 32;
+/// Paths for each pixel on the GPU come in so many batches, whose spread tells their standard error.
+const BATCHES: u32 = 8;
+
+/// Red, green, blue and opacity of all pixels on the GPU.
+fn of_gpu(
+    gpu: &Gpu,
+    volume: &GpuVolume,
+    look: &Look,
+    settings: PathSettings,
+    samples: u32,
+) -> [Vec<Estimate>; 4] {
+    let mut renderer = Renderer::new(gpu, [WIDTH, HEIGHT]).expect("a renderer");
+    let mut batches: Vec<Vec<[f32; 4]>> = Vec::new();
+    let mut before = vec![[0.0_f32; 4]; (WIDTH * HEIGHT) as usize];
+    for batch in 0..BATCHES {
+        for sample in batch * samples..(batch + 1) * samples {
+            renderer.prepare(volume, look, &Pass::Path { settings, sample }, 0, None).expect("a pass");
+            renderer.run(volume).expect("a run");
+        }
+        let count = ((batch + 1) * samples) as f32;
+        let sums: Vec<[f32; 4]> =
+            renderer.pixels().expect("pixels").iter().map(|p| p.map(|v| v * count)).collect();
+        let mean = |(now, before): (&[f32; 4], &[f32; 4])| {
+            std::array::from_fn(|i| (now[i] - before[i]) / samples as f32)
+        };
+        batches.push(sums.iter().zip(&before).map(mean).collect());
+        before = sums;
+    }
+    let count = f64::from(BATCHES);
+    std::array::from_fn(|channel| {
+        let estimate = |pixel: usize| {
+            let values = || batches.iter().map(|batch| f64::from(batch[pixel][channel]));
+            let mean = values().sum::<f64>() / count;
+            let variance = values().map(|value| (value - mean).powi(2)).sum::<f64>() / (count - 1.0) / count;
+            Estimate { mean, variance }
+        };
+        (0..(WIDTH * HEIGHT) as usize).map(estimate).collect()
+    })
+}
+
+fn of_cpu(scene: &Scene<'_>, settings: PathSettings, samples: u32) -> [Vec<Estimate>; 4] {
+    let mut film = Film::new(WIDTH, HEIGHT).expect("a film");
+    let plan = Plan { settings, samples, pass_samples: samples, seed: 5, ..Plan::default() };
+    trace(scene, &plan, &mut film, &mut Watch::default());
+    let all = film.map(|tally| {
+        let [red, green, blue] = tally.light();
+        ([red, green, blue, tally.alpha()], tally.standard_error())
+    });
+    std::array::from_fn(|channel| {
+        let estimate = |(mean, error): &([f32; 4], [f32; 4])| Estimate {
+            mean: mean[channel].into(),
+            variance: f64::from(error[channel]).powi(2),
+        };
+        all.iter().map(estimate).collect()
+    })
+}
+
+fn compare(name: &str, gpu: &Gpu, volume: &GpuVolume, scene: &Scene<'_>, settings: PathSettings) {
+    let look = Look::of_scene(scene).expect("a look");
+    let ours = of_gpu(gpu, volume, &look, settings, 8);
+    let theirs = of_cpu(scene, settings, 64);
+    for (channel, (ours, theirs)) in ["red", "green", "blue", "opacity"].iter().zip(ours.iter().zip(&theirs))
+    {
+        hold(&format!("{name}, {channel}"), ours, theirs);
+    }
+}
+
+/// Holds the mean to three standard errors, and of blocks of 8 × 8 pixels 99 % to three and all to five. What is known of a
+/// block counts as no better than a thousandth of the brightest pixel.
+fn hold(name: &str, ours: &[Estimate], theirs: &[Estimate]) {
+    const BLOCK: usize = 8;
+    let width = WIDTH as usize;
+    let brightest = theirs.iter().map(|pixel| pixel.mean).fold(0.0, f64::max);
+    let over = |pixels: &[usize], floor: f64| {
+        let sum = |of: &dyn Fn(&Estimate) -> f64, picture: &[Estimate]| -> f64 {
+            pixels.iter().map(|i| of(&picture[*i])).sum()
+        };
+        let count = pixels.len() as f64;
+        let means = [ours, theirs].map(|picture| sum(&|pixel| pixel.mean, picture) / count);
+        let variance: f64 =
+            [ours, theirs].map(|p| sum(&|pixel| pixel.variance, p)).iter().sum::<f64>() / count.powi(2);
+        (means, (means[0] - means[1]).abs() / (variance + floor.powi(2)).sqrt())
+    };
+    let all: Vec<usize> = (0..ours.len()).collect();
+    let ([found, expected], off) = over(&all, 1e-3 * expected_floor(theirs));
+    println!("{name}: {found:.5} of {expected:.5}, {off:.2} standard errors");
+    let columns = width / BLOCK;
+    let deviations: Vec<f64> = (0..ours.len() / BLOCK / BLOCK)
+        .map(|block| {
+            let first = block / columns * BLOCK * width + block % columns * BLOCK;
+            let pixels: Vec<usize> =
+                (0..BLOCK * BLOCK).map(|i| first + i / BLOCK * width + i % BLOCK).collect();
+            over(&pixels, 1e-3 * brightest).1
+        })
+        .collect();
+    let good = deviations.iter().filter(|z| **z < 3.0).count();
+    let worst = deviations.iter().copied().fold(0.0, f64::max);
+    println!("{name}: {good} of {} blocks within 3 standard errors, the worst {worst:.2}", deviations.len());
+    assert!(off < 3.0, "{name}: {found} instead of {expected}, {off} standard errors");
+    assert!(good as f64 >= 0.99 * deviations.len() as f64 && worst < 5.0, "{name}: {good}, {worst}");
+}
+
+/// The mean of a picture.
+fn expected_floor(picture: &[Estimate]) -> f64 {
+    picture.iter().map(|pixel| pixel.mean).sum::<f64>() / picture.len() as f64
+}
+
+#[test]
+fn a_cloud_in_the_sun_is_that_of_the_cpu() {
+    let Some(gpu) = gpu() else { return };
+    let channel = cloud();
+    let volume = uploaded(&gpu, &[&channel]);
+    let mut scene = lit(&channel);
+    scene.sky = Sky::Gradient {
+        up: Vec3::Y,
+        zenith: [0.1, 0.2, 0.6],
+        horizon: [0.5, 0.4, 0.3],
+        ground: [0.05, 0.04, 0.02],
+    };
+    compare("grey", &gpu, &volume, &scene, PathSettings::default());
+}
+
+/// Everything at once: colours, heat, four kinds of lights, and a phase function of two lobes.
+#[test]
+fn a_coloured_cloud_that_glows_among_lights_is_that_of_the_cpu() {
+    let Some(gpu) = gpu() else { return };
+    let channel = cloud();
+    let heat = channel_of([IVec3::new(-10, -40, 20), IVec3::new(40, 0, 60)], bent(), &[], |voxel| {
+        common::noise(voxel.as_vec3() / 11.0)
+    });
+    let volume = uploaded(&gpu, &[&channel, &heat]);
+    let mut scene = lit(&channel);
+    let world_box = WorldBox::of(&channel).expect("a place");
+    let (centre, size) = (world_box.centre(), (world_box.max - world_box.min).length());
+    let [strongest, ..] = scene.volumes[0].extinction;
+    scene.volumes[0].extinction = [strongest, 0.6 * strongest, 0.3 * strongest];
+    scene.volumes[0].phase = Phase::Draine { g: 0.3, alpha: 2.0 };
+    let spectrum = Spectrum::Linear { rgb: [0.3, 0.1, 0.02] };
+    scene.volumes[0].emission = Some(Emission { channel: Some(&heat), spectrum });
+    let up = glam::DVec3::Y * size;
+    let bright = |colour: [f32; 3]| colour.map(|c| c * (size * size) as f32);
+    scene.lights = vec![
+        Light::Sun(Sun { angle_degrees: 12.0, ..Sun::point(Vec3::new(0.6, 0.64, 0.48), [3.0, 2.0, 1.0]) }),
+        Light::Point { position: centre + up, intensity: bright([2.0, 1.0, 3.0]) },
+        Light::Sphere { centre: centre - up, radius: 0.3 * size, radiance: [5.0, 9.0, 4.0] },
+        Light::Spot(Spot {
+            position: centre + glam::DVec3::X * size,
+            direction: Vec3::NEG_X,
+            intensity: bright([9.0, 9.0, 3.0]),
+            inner_degrees: 10.0,
+            outer_degrees: 25.0,
+        }),
+    ];
+    let settings = PathSettings { max_scatterings: Some(6), ..PathSettings::default() };
+    compare("coloured", &gpu, &volume, &scene, settings);
+}
