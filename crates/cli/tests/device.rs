@@ -11,7 +11,7 @@ fn render(output: &Path, options: &str) -> Output {
         .arg(testkit::workspace().join("assets/blast/blast.0009.vdb"))
         .arg("--output")
         .arg(output)
-        .args("--up z --size 48 --density 4 --sky-rays 0".split(' '))
+        .args("--up z --size 48 --density 4 --sky 0".split(' '))
         .args(options.split_whitespace())
         .output()
         .expect("a run")
