@@ -88,7 +88,7 @@ fn compare(name: &str, gpu: &Gpu, volume: &GpuVolume, scene: &Scene<'_>, setting
     }
 }
 
-/// Holds the mean to three standard errors, and of blocks of 8 × 8 pixels 99 % to three and all to five. What is known of a
+/// Holds the mean to three standard errors, and of blocks of 8 × 8 pixels 99 %, or all but one, to three and all to five. What is known of a
 /// block counts as no better than a thousandth of the brightest pixel.
 fn hold(name: &str, ours: &[Estimate], theirs: &[Estimate]) {
     const BLOCK: usize = 8;
@@ -120,7 +120,9 @@ fn hold(name: &str, ours: &[Estimate], theirs: &[Estimate]) {
     let worst = deviations.iter().copied().fold(0.0, f64::max);
     println!("{name}: {good} of {} blocks within 3 standard errors, the worst {worst:.2}", deviations.len());
     assert!(off < 3.0, "{name}: {found} instead of {expected}, {off} standard errors");
-    assert!(good as f64 >= 0.99 * deviations.len() as f64 && worst < 5.0, "{name}: {good}, {worst}");
+    // Of a hundred blocks one may be off by chance; a picture this small has fewer, and one of them may be that one.
+    let chance = deviations.len().div_ceil(100);
+    assert!(good + chance >= deviations.len() && worst < 5.0, "{name}: {good}, {worst}");
 }
 
 /// The mean of a picture.
