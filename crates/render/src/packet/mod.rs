@@ -1,9 +1,9 @@
-//! Rays of neighbouring pixels, sixteen at once: a lane each, in one order of steps for all.
+//! Rays of neighbouring pixels, sixteen at once: a lane each.
 //!
 //! A kernel over single rays ([`depth`](crate::depth), [`track`](crate::track), [`surface`](crate::surface)) spends most of
 //! its time on getting from one brick to the next, and its lanes are half empty where a ray leaves a brick. Here each lane is
 //! a ray of its own that goes from box to box: a voxel where there are some, and where there are none as many bricks as its
-//! [`BrickMap`] says are empty. No lane waits for another, so that rays need not have anything in common; but those that do
+//! map of bricks (`walk`) says are empty. No lane waits for another, so that rays need not have anything in common; but those that do
 //! find their values in the same lines of the cache.
 //!
 //! Nothing is shared between lanes, so each ray's result is the same in any company and on any vector instructions. What the
