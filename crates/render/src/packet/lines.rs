@@ -130,18 +130,25 @@ fn places_of<S: Simd>(simd: S, cells: i32x16<S>, voxels: [i32x16<S>; 3]) -> i32x
 fn integrate_voxels<S: Simd, V: Stored>(lanes: &Lanes<'_, S>, values: &[V]) -> [f32; RAYS] {
     let (mut t, mut depth) = (lanes.splat(0.0), lanes.splat(0.0));
     let mut voxels = trunc(lanes.at(t));
-    loop {
+    let [x, y, z] = lanes.inverse;
+    // As far as eight layers of voxels.
+    let ahead = x.abs().min(y.abs()).min(z.abs()) * 8.0;
+    for turn in 0_u32.. {
         let active = t.simd_lt(lanes.ends);
         if !active.any_true() {
-            return depth.to_array();
+            break;
         }
         let cells = lanes.cells(bricks_of(voxels), active);
         let step = lanes.step(voxels, cells, active, t);
+        if turn % LOOK_AHEAD_EACH == 0 {
+            look_ahead(lanes, values, t + ahead);
+        }
         let value = values_of(lanes, values, cells, to_int(voxels));
         // Those that have left stand in an empty cell.
         depth += value * (step.t.min(lanes.ends) - t);
         (t, voxels) = (step.t, step.behind);
     }
+    depth.to_array()
 }
 
 #[inline(always)]
@@ -253,7 +260,7 @@ fn sample_voxels<S: Simd, V: Stored>(
     passes.to_array()
 }
 
-/// Each so many samples, the lines of the cache are asked for in which those stand that come as many later. A brick comes
+/// Each so many turns, the lines of the cache are asked for in which the values stand of about as many turns later. A brick comes
 /// into the caches while the one before it is worked on.
 const LOOK_AHEAD_EACH: u32 = 8;
 
