@@ -84,12 +84,18 @@ pub struct Arrays {
     origin: DVec3,
 }
 
+/// Of which kind a node is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+enum Kind {
+    Node5,
+    Node4,
+}
+
 /// What is in which place already.
 #[derive(Default)]
 struct Gathered {
     masks: HashMap<u32, u32>,
-    node5s: HashMap<(usize, u32), u32>,
-    node4s: HashMap<(usize, u32), u32>,
+    nodes: HashMap<(Kind, usize, u32), u32>,
     bricks: HashMap<(usize, u32), u32>,
 }
 
@@ -224,60 +230,49 @@ impl Arrays {
         let first_cell = self.trees.cells.len() as u32;
         let info = &asset.contents().channels[channel];
         for cell in asset.trees().cells_of(*tree) {
-            let entry = self.node5(asset, channel, cell.entry, form, gathered)?;
+            let entry = self.node(asset, channel, cell.entry, Kind::Node5, form, gathered)?;
             self.trees.cells.push(RootCell { entry, ..*cell });
         }
         Ok(Some(place_of(info, tree, world_from_source, offset, [min, max], first_cell, meaning)))
     }
 
-    /// An entry of a root, with all below it.
-    fn node5(
+    /// An entry of a root or of a `Node5`, which leads to a node of the given kind, with all below it.
+    fn node(
         &mut self,
         asset: &Asset,
         channel: usize,
         entry: Entry,
+        kind: Kind,
         form: Bricks,
         gathered: &mut Gathered,
     ) -> Result<Entry, GpuError> {
         let Some(Content::Node(index)) = entry.content() else { return Ok(entry) };
-        let payload = match gathered.node5s.get(&(channel, index)) {
+        let key = (kind, channel, index);
+        let payload = match gathered.nodes.get(&key) {
             Some(known) => *known,
             None => {
-                let node = asset.trees().node5s.get(index as usize).ok_or_else(damaged)?;
-                let entries = entries_of(asset.trees(), node, NODE5_SLOTS)?;
-                let below: Result<Vec<Entry>, GpuError> =
-                    entries.iter().map(|entry| self.node4(asset, channel, *entry, form, gathered)).collect();
-                let node = self.add_node(asset.trees(), node, NODE5_SLOTS, below?, gathered)?;
-                self.trees.node5s.push(node);
-                let new = self.trees.node5s.len() as u32 - 1;
-                gathered.node5s.insert((channel, index), new);
-                new
-            }
-        };
-        Ok(Entry { payload, ..entry })
-    }
-
-    /// An entry of a `Node5`, with all below it.
-    fn node4(
-        &mut self,
-        asset: &Asset,
-        channel: usize,
-        entry: Entry,
-        form: Bricks,
-        gathered: &mut Gathered,
-    ) -> Result<Entry, GpuError> {
-        let Some(Content::Node(index)) = entry.content() else { return Ok(entry) };
-        let payload = match gathered.node4s.get(&(channel, index)) {
-            Some(known) => *known,
-            None => {
-                let node = asset.trees().node4s.get(index as usize).ok_or_else(damaged)?;
-                let entries = entries_of(asset.trees(), node, NODE4_SLOTS)?;
-                let below: Result<Vec<Entry>, GpuError> =
-                    entries.iter().map(|entry| self.brick(asset, channel, *entry, form, gathered)).collect();
-                let node = self.add_node(asset.trees(), node, NODE4_SLOTS, below?, gathered)?;
-                self.trees.node4s.push(node);
-                let new = self.trees.node4s.len() as u32 - 1;
-                gathered.node4s.insert((channel, index), new);
+                let (nodes, slots) = match kind {
+                    Kind::Node5 => (&asset.trees().node5s, NODE5_SLOTS),
+                    Kind::Node4 => (&asset.trees().node4s, NODE4_SLOTS),
+                };
+                let node = nodes.get(index as usize).ok_or_else(damaged)?;
+                let entries = entries_of(asset.trees(), node, slots)?.iter();
+                let below: Result<Vec<Entry>, GpuError> = match kind {
+                    Kind::Node5 => entries
+                        .map(|entry| self.node(asset, channel, *entry, Kind::Node4, form, gathered))
+                        .collect(),
+                    Kind::Node4 => {
+                        entries.map(|entry| self.brick(asset, channel, *entry, form, gathered)).collect()
+                    }
+                };
+                let node = self.add_node(asset.trees(), node, slots, below?, gathered)?;
+                let nodes = match kind {
+                    Kind::Node5 => &mut self.trees.node5s,
+                    Kind::Node4 => &mut self.trees.node4s,
+                };
+                nodes.push(node);
+                let new = nodes.len() as u32 - 1;
+                gathered.nodes.insert(key, new);
                 new
             }
         };

@@ -449,7 +449,7 @@ impl Crossings {
 pub(crate) const NOWHERE: [f32; CORNERS_SPAN] = [0.0; CORNERS_SPAN];
 
 /// The eight corners of a cell lie in as many consecutive values of a block: one bounds check.
-pub(crate) const CORNERS_SPAN: usize = SIDE * SIDE + SIDE + 2;
+const CORNERS_SPAN: usize = SIDE * SIDE + SIDE + 2;
 
 /// The values from the first to the last corner of the cell at an offset of a block.
 #[inline(always)]

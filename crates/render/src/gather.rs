@@ -53,8 +53,10 @@ pub(crate) fn gather_u16<S: Simd>(simd: S, values: &[u16], at: i32x16<S>) -> u32
     u32x16::simd_from(simd, found)
 }
 
-/// Asks for the lines of the cache in which places of a slice stand, so that they are near when they are looked up.
+/// Asks for the lines of the cache in which places of a slice stand, so that they are near when they are looked up; on other
+/// processors than x86-64 it asks for nothing.
 #[inline(always)]
+#[cfg_attr(not(target_arch = "x86_64"), expect(unused_variables, reason = "there is no such instruction"))]
 pub(crate) fn prefetch<S: Simd, V>(values: &[V], at: i32x16<S>) {
     #[cfg(target_arch = "x86_64")]
     {

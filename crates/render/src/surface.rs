@@ -135,13 +135,7 @@ fn meet_surface<'a, S: Simd>(
 
 /// Where the interpolation in a cell reaches the surface, which it has done at the end.
 #[inline(always)]
-pub(crate) fn meet_in_cell(
-    block: &Block,
-    origin: Vec3,
-    direction: Vec3,
-    [t0, t1]: [f32; 2],
-    surface: f32,
-) -> f32 {
+fn meet_in_cell(block: &Block, origin: Vec3, direction: Vec3, [t0, t1]: [f32; 2], surface: f32) -> f32 {
     let cell = (origin + direction * (0.5 * (t0 + t1))).clamp(Vec3::ZERO, Vec3::splat(7.0)).floor();
     let c = corners_at(block, cell);
     let value = |t: f32| {

@@ -152,9 +152,9 @@ impl<'a> Field<'a> {
     }
 
     /// A flat map of the bricks in which interpolation reaches a level.
-    pub(crate) fn map_above(&self, accessor: &mut Accessor<'a>, level: f32) -> Option<BrickMap> {
+    pub(crate) fn map_above(&self, level: f32) -> Option<BrickMap> {
         let [first, last] = self.brick_box;
-        BrickMap::above(accessor, level, first, last)
+        BrickMap::above(&mut Accessor::new(&self.channel.tree), level, first, last)
     }
 
     /// The brick whose first voxel is at a position of the walk.

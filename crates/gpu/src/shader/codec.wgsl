@@ -37,6 +37,14 @@ fn byte_at(first_word: u32, i: u32) -> u32 {
     return (brick_word(first_word + (i >> 2u)) >> ((i & 3u) * 8u)) & 0xffu;
 }
 
+// What a code adds to what is predicted of a voxel: its line stands in a word, and all codes behind. Without bits there is none.
+fn rest_value(at: u32, unit: f32, bits: u32, voxel: u32) -> f32 {
+    if (bits == 0u) {
+        return 0.0;
+    }
+    return line_at(line_of(brick_word(at), unit), bits_at(at + 1u, voxel * bits, bits));
+}
+
 // The interpolation of corners, whose line and codes stand in three words.
 fn corners_value(at: u32, unit: f32, p: vec3<u32>) -> f32 {
     let line = line_of(brick_word(at), unit);
@@ -162,20 +170,10 @@ fn plain_value(tag: u32, at: u32, unit: f32, p: vec3<u32>) -> f32 {
         return line.low + line.step * block_value(tag - FIRST_BLOCK_TAG, at + 1u, p);
     }
     if (HAS_LATTICE && tag >= FIRST_LATTICE_TAG) {
-        let bits = tag - FIRST_LATTICE_TAG;
-        let predicted = lattice_value(at, unit, p);
-        if (bits == 0u) {
-            return predicted;
-        }
-        return predicted + line_at(line_of(brick_word(at + 17u), unit), bits_at(at + 18u, voxel * bits, bits));
+        return lattice_value(at, unit, p) + rest_value(at + 17u, unit, tag - FIRST_LATTICE_TAG, voxel);
     }
     if (HAS_GRADIENT && tag >= FIRST_GRADIENT_TAG) {
-        let bits = tag - FIRST_GRADIENT_TAG;
-        let predicted = corners_value(at, unit, p);
-        if (bits == 0u) {
-            return predicted;
-        }
-        return predicted + line_at(line_of(brick_word(at + 3u), unit), bits_at(at + 4u, voxel * bits, bits));
+        return corners_value(at, unit, p) + rest_value(at + 3u, unit, tag - FIRST_GRADIENT_TAG, voxel);
     }
     return 0.0;
 }

@@ -1,9 +1,9 @@
 //! Line integrals along the rays of a packet: what [`depth`](crate::depth) gives for each of them.
 
-use fearless_simd::{Level, Simd, dispatch, f32x16, i32x16, prelude::*};
+use fearless_simd::{Level, Simd, dispatch, f32x16, i32x16, mask32x16, prelude::*};
 use nuage_volume::brick::Bricks;
 
-use super::{Lanes, Packet, RAYS, bricks_of, each_ray, interpolate, to_int, trunc};
+use super::{Lanes, Packet, RAYS, Stretch, bricks_of, each_ray, interpolate, to_int};
 use crate::blocks::Blocks;
 use crate::camera::Ray;
 use crate::depth::{self, NEAREST_SHIFT, Stored};
@@ -128,26 +128,24 @@ fn places_of<S: Simd>(simd: S, cells: i32x16<S>, voxels: [i32x16<S>; 3]) -> i32x
 
 #[inline(always)]
 fn integrate_voxels<S: Simd, V: Stored>(lanes: &Lanes<'_, S>, values: &[V]) -> [f32; RAYS] {
-    let (mut t, mut depth) = (lanes.splat(0.0), lanes.splat(0.0));
-    let mut voxels = trunc(lanes.at(t));
+    let (none, mut depth) = (mask32x16::splat(lanes.simd, false), lanes.splat(0.0));
     let [x, y, z] = lanes.inverse;
     // As far as eight layers of voxels.
     let ahead = x.abs().min(y.abs()).min(z.abs()) * 8.0;
-    for turn in 0_u32.. {
-        let active = t.simd_lt(lanes.ends);
-        if !active.any_true() {
-            break;
-        }
-        let cells = lanes.cells(bricks_of(voxels), active);
-        let step = lanes.step(voxels, cells, active, t);
-        if turn % LOOK_AHEAD_EACH == 0 {
-            look_ahead(lanes, values, t + ahead);
-        }
-        let value = values_of(lanes, values, cells, to_int(voxels));
-        // Those that have left stand in an empty cell.
-        depth += value * (step.t.min(lanes.ends) - t);
-        (t, voxels) = (step.t, step.behind);
-    }
+    let mut turn = 0_u32;
+    lanes.each_stretch(
+        #[inline(always)]
+        |stretch| {
+            if turn % LOOK_AHEAD_EACH == 0 {
+                look_ahead(lanes, values, stretch.t + ahead);
+            }
+            turn = turn.wrapping_add(1);
+            // Those that have left stand in an empty cell.
+            depth +=
+                values_of(lanes, values, stretch.cells, to_int(stretch.voxels)) * (stretch.end - stretch.t);
+            none
+        },
+    );
     depth.to_array()
 }
 
@@ -157,27 +155,24 @@ fn integrate_cells<'a, S: Simd>(
     field: &Field<'a>,
     blocks: &mut Blocks<'a>,
 ) -> [f32; RAYS] {
-    let (mut t, mut depth) = (lanes.splat(0.0), lanes.splat(0.0));
-    let mut voxels = trunc(lanes.at(t));
-    loop {
-        let active = t.simd_lt(lanes.ends);
-        if !active.any_true() {
-            return depth.to_array();
-        }
-        let cells = lanes.cells(bricks_of(voxels), active);
-        let step = lanes.step(voxels, cells, active, t);
-        if (cells.simd_ge(0) & active).any_true() {
-            let end = step.t.min(lanes.ends);
-            let length = end - t;
-            let corners = lanes.corners(field, blocks, cells, to_int(voxels));
-            let middle = lanes.at((t + end) * 0.5);
-            let along = |axis: usize| (middle[axis] - voxels[axis], lanes.direction[axis] * length);
-            let ((x, dx), (y, dy), (z, dz)) = (along(0), along(1), along(2));
-            let mean = depth::mean_in_cell!(corners, [x, y, z], [dx, dy, dz]);
-            depth += lanes.with_specials(cells, mean) * length;
-        }
-        (t, voxels) = (step.t, step.behind);
-    }
+    let (none, mut depth) = (mask32x16::splat(lanes.simd, false), lanes.splat(0.0));
+    lanes.each_stretch(
+        #[inline(always)]
+        |stretch| {
+            if stretch.is_filled().any_true() {
+                let Stretch { t, end, voxels, cells, .. } = *stretch;
+                let length = end - t;
+                let corners = lanes.corners(field, blocks, cells, to_int(voxels));
+                let middle = lanes.at((t + end) * 0.5);
+                let along = |axis: usize| (middle[axis] - voxels[axis], lanes.direction[axis] * length);
+                let ((x, dx), (y, dy), (z, dz)) = (along(0), along(1), along(2));
+                let mean = depth::mean_in_cell!(corners, [x, y, z], [dx, dy, dz]);
+                depth += lanes.with_specials(cells, mean) * length;
+            }
+            none
+        },
+    );
+    depth.to_array()
 }
 
 /// Goes from cell to cell: two samples or so lie in each, and its corners are looked up once.
@@ -191,37 +186,35 @@ fn sample_cells<'a, S: Simd>(
 ) -> [f32; RAYS] {
     let (zero, one) = (lanes.splat(0.0), lanes.splat(1.0));
     let (per_step, loss) = (one / steps, steps * extinction);
-    let (mut number, mut t, mut passes) = (zero, zero, one);
-    let mut voxels = trunc(lanes.at(t));
-    loop {
-        let active = t.simd_lt(lanes.ends);
-        if !active.any_true() {
-            return passes.to_array();
-        }
-        let cells = lanes.cells(bricks_of(voxels), active);
-        let step = lanes.step(voxels, cells, active, t);
-        let end = step.t.min(lanes.ends);
-        let is_empty = cells.simd_lt(0);
-        let mut t_sample = number * steps;
-        let mut inside = active & !is_empty & t_sample.simd_lt(end);
-        if inside.any_true() {
-            let corners = lanes.corners(field, blocks, cells, to_int(voxels));
-            while inside.any_true() {
-                let position = lanes.at(t_sample);
-                let along = |axis: usize| position[axis] - voxels[axis];
-                let value = interpolate(&corners, [along(0), along(1), along(2)]);
-                let lost = lanes.with_specials(cells, value) * loss;
-                passes *= one - inside.select(lost, zero);
-                number += inside.select(one, zero);
-                t_sample = number * steps;
-                inside &= t_sample.simd_lt(end);
+    let none = mask32x16::splat(lanes.simd, false);
+    let (mut number, mut passes) = (zero, one);
+    lanes.each_stretch(
+        #[inline(always)]
+        |stretch| {
+            let Stretch { end, voxels, cells, .. } = *stretch;
+            let mut t_sample = number * steps;
+            let mut inside = stretch.is_filled() & t_sample.simd_lt(end);
+            if inside.any_true() {
+                let corners = lanes.corners(field, blocks, cells, to_int(voxels));
+                while inside.any_true() {
+                    let position = lanes.at(t_sample);
+                    let along = |axis: usize| position[axis] - voxels[axis];
+                    let value = interpolate(&corners, [along(0), along(1), along(2)]);
+                    let lost = lanes.with_specials(cells, value) * loss;
+                    passes *= one - inside.select(lost, zero);
+                    number += inside.select(one, zero);
+                    t_sample = number * steps;
+                    inside &= t_sample.simd_lt(end);
+                }
             }
-        }
-        if is_empty.any_true() {
-            number = is_empty.select((end * per_step).ceil().max(number), number);
-        }
-        (t, voxels) = (step.t, step.behind);
-    }
+            let is_empty = cells.simd_lt(0);
+            if is_empty.any_true() {
+                number = is_empty.select((end * per_step).ceil().max(number), number);
+            }
+            none
+        },
+    );
+    passes.to_array()
 }
 
 /// Goes from sample to sample.

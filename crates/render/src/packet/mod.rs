@@ -166,6 +166,27 @@ struct Lanes<'m, S: Simd> {
     ends: f32x16<S>,
 }
 
+/// The stretches of rays through the boxes they are in.
+struct Stretch<S: Simd> {
+    /// Where they begin and end.
+    t: f32x16<S>,
+    end: f32x16<S>,
+    /// The voxels in which they begin, along each axis.
+    voxels: [f32x16<S>; 3],
+    /// The cells of the map; those of rays that are not active are empty.
+    cells: i32x16<S>,
+    /// The rays that are still on their way.
+    active: mask32x16<S>,
+}
+
+impl<S: Simd> Stretch<S> {
+    /// The rays that are in a brick or in a box of one value other than zero.
+    #[inline(always)]
+    fn is_filled(&self) -> mask32x16<S> {
+        self.active & self.cells.simd_ge(0)
+    }
+}
+
 /// A step of a ray out of the box it is in.
 struct Step<S: Simd> {
     /// Where it leaves the box.
@@ -248,6 +269,26 @@ impl<'m, S: Simd> Lanes<'m, S> {
         match is_special.any_true() {
             true => is_special.select(gather_f32(self.simd, self.map.constants(), cells - SPECIAL), others),
             false => others,
+        }
+    }
+
+    /// Goes along all rays from box to box, voxel by voxel where cells of the map hold bricks. Calls with each stretch, until
+    /// rays leave the field or the call says of which ones it has found what it looks for.
+    #[inline(always)]
+    fn each_stretch(&self, mut visit: impl FnMut(&Stretch<S>) -> mask32x16<S>) {
+        let zero = self.splat(0.0);
+        let (mut t, mut ends) = (zero, self.ends);
+        let mut voxels = trunc(self.at(t));
+        loop {
+            let active = t.simd_lt(ends);
+            if !active.any_true() {
+                return;
+            }
+            let cells = self.cells(bricks_of(voxels), active);
+            let step = self.step(voxels, cells, active, t);
+            let found = visit(&Stretch { t, end: step.t.min(ends), voxels, cells, active });
+            ends = found.select(zero, ends);
+            (t, voxels) = (step.t, step.behind);
         }
     }
 

@@ -2,9 +2,8 @@
 
 use fearless_simd::{Level, Simd, dispatch, f32x16, mask32x16, prelude::*};
 use glam::Vec3;
-use nuage_volume::accessor::Accessor;
 
-use super::{Lanes, Packet, RAYS, bricks_of, each_ray, interpolate, to_int, trunc};
+use super::{Lanes, Packet, RAYS, Stretch, bricks_of, each_ray, interpolate, to_int, trunc};
 use crate::blocks::Blocks;
 use crate::camera::Ray;
 use crate::simd::level;
@@ -27,7 +26,7 @@ pub struct Surface<'f, 'a> {
 impl<'f, 'a> Surface<'f, 'a> {
     /// Makes a surface ready.
     pub fn new(field: &'f Field<'a>, level: f32) -> Self {
-        let map = field.map_above(&mut Accessor::new(field.tree()), level);
+        let map = field.map_above(level);
         Surface { field, level, map }
     }
 
@@ -109,40 +108,35 @@ struct Met<S: Simd> {
 fn meet<'a, S: Simd>(lanes: &Lanes<'_, S>, field: &Field<'a>, blocks: &mut Blocks<'a>, level: f32) -> Met<S> {
     let (zero, level) = (lanes.splat(0.0), lanes.splat(level));
     let mut met = Met { rays: 0, ends: [zero; 2], voxels: [zero; 3], corners: [zero; 8] };
-    let (mut t, mut ends) = (zero, lanes.ends);
-    let mut voxels = trunc(lanes.at(t));
-    loop {
-        let active = t.simd_lt(ends);
-        if !active.any_true() {
-            return met;
-        }
-        let cells = lanes.cells(bricks_of(voxels), active);
-        let step = lanes.step(voxels, cells, active, t);
-        if (active & cells.simd_ge(0)).any_true() {
-            let leaves = step.t.min(ends);
-            // A special cell has one value, which reaches the level.
-            let is_special = cells.simd_ge(SPECIAL);
-            let corners = lanes.corners(field, blocks, cells, to_int(voxels));
-            // Where a ray leaves a cell, the value is that of the next one too.
-            let end = lanes.at(leaves);
-            let along = |axis: usize| end[axis] - voxels[axis];
-            let value = interpolate(&corners, [along(0), along(1), along(2)]);
-            let reaches = value.simd_ge(level) & cells.simd_lt(SPECIAL);
-            let reached = active & cells.simd_ge(0) & (reaches | is_special);
+    lanes.each_stretch(
+        #[inline(always)]
+        |stretch| {
+            let mut reached = stretch.is_filled();
             if reached.any_true() {
-                met.rays |= reached.to_bitmask() as u32;
-                met.ends = [reached.select(t, met.ends[0]), reached.select(leaves, met.ends[1])];
-                for (met, voxel) in met.voxels.iter_mut().zip(voxels) {
-                    *met = reached.select(voxel, *met);
+                let Stretch { t, end, voxels, cells, .. } = *stretch;
+                // A special cell has one value, which reaches the level.
+                let is_special = cells.simd_ge(SPECIAL);
+                let corners = lanes.corners(field, blocks, cells, to_int(voxels));
+                // Where a ray leaves a cell, the value is that of the next one too.
+                let position = lanes.at(end);
+                let along = |axis: usize| position[axis] - voxels[axis];
+                let value = interpolate(&corners, [along(0), along(1), along(2)]);
+                reached &= is_special | value.simd_ge(level);
+                if reached.any_true() {
+                    met.rays |= reached.to_bitmask() as u32;
+                    met.ends = [reached.select(t, met.ends[0]), reached.select(end, met.ends[1])];
+                    for (met, voxel) in met.voxels.iter_mut().zip(voxels) {
+                        *met = reached.select(voxel, *met);
+                    }
+                    for (met, corner) in met.corners.iter_mut().zip(corners) {
+                        *met = reached.select(is_special.select(level, corner), *met);
+                    }
                 }
-                for (met, corner) in met.corners.iter_mut().zip(corners) {
-                    *met = reached.select(is_special.select(level, corner), *met);
-                }
-                ends = reached.select(zero, ends);
             }
-        }
-        (t, voxels) = (step.t, step.behind);
-    }
+            reached
+        },
+    );
+    met
 }
 
 impl<S: Simd> Met<S> {

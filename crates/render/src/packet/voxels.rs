@@ -5,7 +5,7 @@ use glam::Vec3;
 use nuage_volume::brick::Bricks;
 
 use super::lines::values_of;
-use super::{Lanes, Packet, RAYS, bricks_of, each_ray, to_int, trunc};
+use super::{Lanes, Packet, RAYS, each_ray, to_int};
 use crate::camera::Ray;
 use crate::depth::{NEAREST_SHIFT, Stored};
 use crate::simd::level;
@@ -69,30 +69,25 @@ struct Met {
 #[inline(always)]
 fn meet<S: Simd, V: Stored>(lanes: &Lanes<'_, S>, values: &[V], above: f32) -> Met {
     let zero = lanes.splat(0.0);
-    let (mut t, mut ends) = (zero, lanes.ends);
-    let mut voxels = trunc(lanes.at(t));
     let (mut rays, mut met_t, mut met_value, mut places) = (0, zero, zero, [zero; 3]);
-    loop {
-        let active = t.simd_lt(ends);
-        if !active.any_true() {
-            let places = [places[0].to_array(), places[1].to_array(), places[2].to_array()];
-            return Met { rays, t: met_t.to_array(), places, values: met_value.to_array() };
-        }
-        let cells = lanes.cells(bricks_of(voxels), active);
-        let step = lanes.step(voxels, cells, active, t);
-        if (active & cells.simd_ge(0)).any_true() {
-            let value = values_of(lanes, values, cells, to_int(voxels));
-            // What is empty is not above anything.
-            let met = active & value.simd_gt(above);
+    lanes.each_stretch(
+        #[inline(always)]
+        |stretch| {
+            let mut met = stretch.is_filled();
             if met.any_true() {
-                rays |= met.to_bitmask() as u32;
-                (met_t, met_value) = (met.select(t, met_t), met.select(value, met_value));
-                for (place, voxel) in places.iter_mut().zip(voxels) {
-                    *place = met.select(voxel, *place);
+                let value = values_of(lanes, values, stretch.cells, to_int(stretch.voxels));
+                met &= value.simd_gt(above);
+                if met.any_true() {
+                    rays |= met.to_bitmask() as u32;
+                    (met_t, met_value) = (met.select(stretch.t, met_t), met.select(value, met_value));
+                    for (place, voxel) in places.iter_mut().zip(stretch.voxels) {
+                        *place = met.select(voxel, *place);
+                    }
                 }
-                ends = met.select(zero, ends);
             }
-        }
-        (t, voxels) = (step.t, step.behind);
-    }
+            met
+        },
+    );
+    let places = [places[0].to_array(), places[1].to_array(), places[2].to_array()];
+    Met { rays, t: met_t.to_array(), places, values: met_value.to_array() }
 }
