@@ -58,7 +58,8 @@ impl Place {
     /// The corners, in the world, of the box of all voxels other than zero.
     pub(crate) fn world_corners(&self) -> [DVec3; 8] {
         let first = self.active_box.min.as_dvec3() - 0.5;
-        let size = (self.active_box.max - self.active_box.min + 1).as_dvec3();
+        // In doubles: 32 bits may not hold it.
+        let size = self.active_box.max.as_dvec3() - self.active_box.min.as_dvec3() + 1.0;
         std::array::from_fn(|i| {
             let corner = DVec3::new((i >> 2) as f64, (i >> 1 & 1) as f64, (i & 1) as f64);
             self.world_from_index.transform_point3(first + corner * size)
@@ -67,7 +68,7 @@ impl Place {
 
     /// The field, in a world that begins at `origin`: as `nuage_render::traverse::Field` has it.
     pub(crate) fn field(&self, origin: DVec3) -> Field {
-        let (min, max) = (self.active_box.min - 1, self.active_box.max);
+        let (min, max) = (self.active_box.min.saturating_sub(IVec3::ONE), self.active_box.max);
         let base_brick: IVec3 = (min >> LOG2_BRICK) - 1;
         let base = (base_brick << LOG2_BRICK).as_dvec3();
         let index_from_world = self.world_from_index.inverse();

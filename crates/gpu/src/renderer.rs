@@ -321,8 +321,7 @@ impl Renderer {
     fn target(&self, format: wgpu::TextureFormat) -> Result<wgpu::RenderPipeline, GpuError> {
         let device = self.gpu.device();
         // Eight bits hold encoded colours; formats that say so encode by themselves, and those of floats hold light.
-        let is_unorm = format.sample_type(None, None).is_some_and(|_| !format.is_srgb())
-            && matches!(format, wgpu::TextureFormat::Rgba8Unorm | wgpu::TextureFormat::Bgra8Unorm);
+        let is_unorm = matches!(format, wgpu::TextureFormat::Rgba8Unorm | wgpu::TextureFormat::Bgra8Unorm);
         let features = Features {
             codecs: 0,
             chunks: 0,

@@ -33,7 +33,8 @@ struct Summary {
     codecs: u32,
     frames: usize,
     channels: usize,
-    largest: Vec<f32>,
+    /// Of the first channel.
+    largest: f32,
     /// Of the first channel.
     places: Vec<Option<Place>>,
 }
@@ -102,7 +103,6 @@ impl Volume {
         let descriptor = wgpu::BindGroupLayoutDescriptor { label: Some("nuage volume"), entries: &entries };
         let layout = gpu.guarded(|| gpu.device().create_bind_group_layout(&descriptor))?;
         let bind_group = bind(gpu, "nuage volume", &layout, &all)?;
-        let channels = arrays.channels();
         Ok(Volume {
             layout,
             bind_group,
@@ -111,8 +111,8 @@ impl Volume {
                 origin: arrays.origin(),
                 codecs: arrays.codecs(),
                 frames: arrays.frames(),
-                channels,
-                largest: (0..channels).map(|channel| arrays.largest(channel)).collect(),
+                channels: arrays.channels(),
+                largest: arrays.largest(0),
                 places: (0..arrays.frames()).map(|frame| arrays.place(frame, 0).copied()).collect(),
             },
             chunks: chunks as u32,
@@ -168,7 +168,7 @@ impl Volume {
 
     /// The largest value of the first channel.
     pub(crate) fn largest(&self) -> f32 {
-        self.arrays.largest.first().copied().unwrap_or(0.0)
+        self.arrays.largest
     }
 
     /// Where the first channel is in a frame.
