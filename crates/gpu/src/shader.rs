@@ -306,7 +306,12 @@ fn prelude(features: &Features) -> String {
     p.f("EXP_HIGHEST", math::EXP_HIGHEST);
     p.f("OPAQUE_DEPTH", math::OPAQUE_DEPTH);
     p.i("ROOT_HALF", math::ROOT_HALF);
-    let series = [("EXP", &math::EXP_SERIES[..]), ("SIN", &math::SIN_SERIES), ("COS", &math::COS_SERIES)];
+    let series = [
+        ("EXP", &math::EXP_SERIES[..]),
+        ("LN", &math::LN_SERIES),
+        ("SIN", &math::SIN_SERIES),
+        ("COS", &math::COS_SERIES),
+    ];
     for (name, terms) in series {
         terms.iter().enumerate().for_each(|(i, term)| p.f(&format!("{name}_SERIES_{i}"), *term));
     }
@@ -322,6 +327,10 @@ fn prelude(features: &Features) -> String {
     p.f("DRAINE_TOLERANCE", phase::TOLERANCE);
     p.u("DRAINE_MAX_STEPS", phase::MAX_STEPS);
     p.f("SRGB_LINEAR_END", color::SRGB_LINEAR_END);
+    p.f("SRGB_SLOPE", color::SRGB_SLOPE);
+    p.f("SRGB_SCALE", color::SRGB_SCALE);
+    p.f("SRGB_OFFSET", color::SRGB_OFFSET);
+    p.f("SRGB_GAMMA", color::SRGB_GAMMA);
     p.f("COLDEST_KELVIN", Blackbody::COLDEST_KELVIN);
     p.f("HOTTEST_KELVIN", Blackbody::HOTTEST_KELVIN);
     p.f("BLACKBODY_STEPS", Blackbody::STEPS as f32);
@@ -361,6 +370,8 @@ fn prelude(features: &Features) -> String {
     p.u("FIRST_SPARSE_TAG", codec::SPARSE_TAG);
     p.u("FIRST_FITTED_TAG", codec::SPARSE_FITTED_TAG);
     p.u("SPARSE_BENT", sparse::BENT);
+    p.f("SPARSE_BENT_START", sparse::BENT_START);
+    p.f("SPARSE_BENT_GROWTH", sparse::BENT_GROWTH);
     p.u("SPARSE_HAS_ENDS", sparse::HAS_ENDS);
     p.f("SPARSE_LAST_END", sparse::LAST_END);
     CODEC_KINDS

@@ -16,17 +16,32 @@ pub fn luminance(rgb: [f32; 3]) -> f32 {
 /// Up to here the curve of sRGB is straight.
 pub const SRGB_LINEAR_END: f32 = 0.003_130_8;
 
+/// The slope of that part; beyond it the curve is `SRGB_SCALE × linear ^ (1 / SRGB_GAMMA) − SRGB_OFFSET`.
+pub const SRGB_SLOPE: f32 = 12.92;
+/// See [`SRGB_SLOPE`].
+pub const SRGB_SCALE: f32 = 1.055;
+/// See [`SRGB_SLOPE`].
+pub const SRGB_OFFSET: f32 = 0.055;
+/// See [`SRGB_SLOPE`].
+pub const SRGB_GAMMA: f32 = 2.4;
+
 /// The sRGB encoding of a linear component (IEC 61966-2-1). Does not clamp: negative values continue the
 /// straight part at the foot, values above 1 the curve.
 #[inline]
 pub fn linear_to_srgb(linear: f32) -> f32 {
-    if linear <= SRGB_LINEAR_END { 12.92 * linear } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 }
+    match linear <= SRGB_LINEAR_END {
+        true => SRGB_SLOPE * linear,
+        false => SRGB_SCALE * linear.powf(1.0 / SRGB_GAMMA) - SRGB_OFFSET,
+    }
 }
 
 /// The linear component of an sRGB encoded one (IEC 61966-2-1): undoes [`linear_to_srgb`].
 #[inline]
 pub fn srgb_to_linear(encoded: f32) -> f32 {
-    if encoded <= 0.040_45 { encoded / 12.92 } else { ((encoded + 0.055) / 1.055).powf(2.4) }
+    match encoded <= 0.040_45 {
+        true => encoded / SRGB_SLOPE,
+        false => ((encoded + SRGB_OFFSET) / SRGB_SCALE).powf(SRGB_GAMMA),
+    }
 }
 
 /// The nearest eight-bit sRGB code of a linear component; clamps to 0..=255. NaN gives 0.

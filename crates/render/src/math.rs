@@ -11,6 +11,9 @@
 /// that integer in the low mantissa bits: a rounding without a call or a conversion. It is 1.5 · 2^23.
 const ROUND: f32 = 12_582_912.0;
 
+/// Of the logarithm: ½ ln((1 + s) / (1 − s)) is s and the sum of these times s³, s⁵ and so on.
+pub const LN_SERIES: [f32; 4] = [1.0 / 3.0, 1.0 / 5.0, 1.0 / 7.0, 1.0 / 9.0];
+
 /// ln 2 in two parts. The first has few enough bits that its product with any exponent is exact.
 pub const LN_2_HIGH: f32 = 0.693_359_4;
 /// What the first part lacks.
@@ -98,7 +101,8 @@ pub fn ln(x: f32) -> f32 {
     let mantissa = f32::from_bits(((bits & 0x007f_ffff) + ROOT_HALF) as u32);
     let s = (mantissa - 1.0) / (mantissa + 1.0);
     let s2 = s * s;
-    let series = s2 * (1.0 / 3.0 + s2 * (1.0 / 5.0 + s2 * (1.0 / 7.0 + s2 * (1.0 / 9.0))));
+    let [a, b, c, d] = LN_SERIES;
+    let series = s2 * (a + s2 * (b + s2 * (c + s2 * d)));
     // ln 2 in two parts, of which the first times an exponent is exact.
     exponent * LN_2_HIGH + (2.0 * s + (2.0 * s * series + exponent * LN_2_LOW))
 }

@@ -137,7 +137,7 @@ fn sparse_value(brick_at: u32, unit: f32, is_fitted: bool, p: vec3<u32>) -> f32 
         return predicted + line_at(line, code);
     }
     let part = f32(code) / f32((1u << own_bits) - 1u);
-    let bent = select(part, part * (0.2 + 0.8 * part), is_bent);
+    let bent = select(part, part * (SPARSE_BENT_START + SPARSE_BENT_GROWTH * part), is_bent);
     var ends = vec2<f32>(0.0, 1.0);
     if (has_ends) {
         let both = byte_at(ends_at, octant);

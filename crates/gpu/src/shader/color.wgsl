@@ -2,9 +2,9 @@
 
 fn linear_to_srgb(linear: f32) -> f32 {
     if (linear <= SRGB_LINEAR_END) {
-        return 12.92 * linear;
+        return SRGB_SLOPE * linear;
     }
-    return 1.055 * pow(linear, 1.0 / 2.4) - 0.055;
+    return SRGB_SCALE * pow(linear, 1.0 / SRGB_GAMMA) - SRGB_OFFSET;
 }
 
 // The full colour of a hue: 0 and 1 are red, a third green, two thirds blue.

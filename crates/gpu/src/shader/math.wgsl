@@ -33,7 +33,7 @@ fn ln(x: f32) -> f32 {
     let mantissa = bitcast<f32>((bits & 0x007fffff) + ROOT_HALF);
     let s = (mantissa - 1.0) / (mantissa + 1.0);
     let s2 = s * s;
-    let series = s2 * (1.0 / 3.0 + s2 * (1.0 / 5.0 + s2 * (1.0 / 7.0 + s2 * (1.0 / 9.0))));
+    let series = s2 * (LN_SERIES_0 + s2 * (LN_SERIES_1 + s2 * (LN_SERIES_2 + s2 * LN_SERIES_3)));
     return exponent * LN_2_HIGH + (2.0 * s + (2.0 * s * series + exponent * LN_2_LOW));
 }
 

@@ -104,7 +104,7 @@ impl Coding {
     /// thin is seen as well as what is dense and hides itself, so it should be told more exactly.
     #[inline]
     pub fn bent(part: f32) -> f32 {
-        part * (0.2 + 0.8 * part)
+        part * (BENT_START + BENT_GROWTH * part)
     }
 
     /// What [`Coding::bent`] makes of some part, back.
@@ -113,6 +113,11 @@ impl Coding {
         ((0.04 + 3.2 * bent).sqrt() - 0.2) / 1.6
     }
 }
+
+/// How fast bent codes go at first, and how much faster at the end, where they have gone all the way.
+pub const BENT_START: f32 = 0.2;
+/// See [`BENT_START`].
+pub const BENT_GROWTH: f32 = 0.8;
 
 /// What is added to the bits of codes in their word if they are bent.
 pub const BENT: u32 = 8;
