@@ -211,23 +211,27 @@ fn plot(points: &[(f64, Vec<f64>)]) -> String {
     }
     svg += &text(0.5 * width, height - 8.0, "middle", "bricks that a ray crosses");
     svg += &text(8.0, 20.0, "start", "ns per ray (figures: cubic)");
-    for (i, kernel) in KERNELS.iter().enumerate() {
+    // From the top down, so that names of lines which end together stand below each other.
+    let (end, end_ns) = &points[last];
+    let mut order: Vec<usize> = (0..KERNELS.len()).collect();
+    order.sort_by(|a, b| end_ns[*b].total_cmp(&end_ns[*a]));
+    let mut free_from = 0.0;
+    for i in order {
         let colour = format!("hsl({},70%,40%)", 72 * i);
         let line: String = points.iter().map(|(b, ns)| format!("{:.1},{:.1} ", x(*b), y(ns[i]))).collect();
         svg +=
             &format!("<polyline points=\"{line}\" fill=\"none\" stroke=\"{colour}\" stroke-width=\"2\"/>\n");
-        // Before the last point, where lines are furthest apart.
-        let (bricks, ns) = &points[last - 1];
-        svg += &text(x(*bricks), y(ns[i]) - 6.0, "end", kernel);
+        let label = f64::max(y(end_ns[i]) + 4.0, free_from);
+        svg += &text(x(*end) + 6.0, label, "start", KERNELS[i]);
+        free_from = label + 13.0;
     }
     // As fast as bricks grow, from the first point of the first kernel.
     let (first, first_ns) = (points[0].0, points[0].1[0]);
-    let end = points[last].0;
     svg += &format!(
         "<line x1=\"{:.1}\" y1=\"{:.1}\" x2=\"{:.1}\" y2=\"{:.1}\" stroke=\"grey\" stroke-dasharray=\"4\"/>\n",
         x(first),
         y(first_ns),
-        x(end),
+        x(*end),
         y(first_ns * end / first)
     );
     svg + "</svg>\n"

@@ -136,7 +136,7 @@ fn integrate_voxels<S: Simd, V: Stored>(lanes: &Lanes<'_, S>, values: &[V]) -> [
     lanes.each_stretch(
         #[inline(always)]
         |stretch| {
-            if turn % LOOK_AHEAD_EACH == 0 {
+            if turn.is_multiple_of(LOOK_AHEAD_EACH) {
                 look_ahead(lanes, values, stretch.t + ahead);
             }
             turn = turn.wrapping_add(1);
@@ -239,7 +239,7 @@ fn sample_voxels<S: Simd, V: Stored>(
         let is_empty = cells.simd_lt(0);
         number += one;
         if !is_empty.all_true() {
-            if turn % LOOK_AHEAD_EACH == 0 {
+            if turn.is_multiple_of(LOOK_AHEAD_EACH) {
                 look_ahead(lanes, values, t + steps * (2 * LOOK_AHEAD_EACH) as f32);
             }
             passes *= one - values_of(lanes, values, cells, to_int(position)) * loss;
