@@ -1,16 +1,23 @@
-//! What crosses to the shaders, as plain bytes: twins of the structures in `shader/bindings.wgsl`, and how fields and
-//! lights become them.
+//! What crosses to the shaders, as plain bytes: twins of the structures in `shader/bindings.wgsl`, and how fields, solids
+//! and lights become them.
 //!
 //! What does not live here: words of trees and bricks ([`crate::arrays`]), and who sends all this ([`crate::renderer`]).
 
 use bytemuck::{Pod, Zeroable};
-use glam::{DAffine3, DVec3, IVec3, Vec3};
+use glam::{DAffine3, DVec3, IVec3, Vec3, Vec4};
 use nuage_render::light::Light;
 use nuage_volume::channel::IndexBox;
 use nuage_volume::space::LOG2_BRICK;
 
 /// The most lights of a scene.
 pub const MAX_LIGHTS: usize = 16;
+/// The most volumes of a scene.
+pub const MAX_MEDIA: usize = 16;
+
+/// What a medium is, as shaders know it.
+pub(crate) const SHAPE_GRID: u32 = 0;
+pub(crate) const SHAPE_BOX: u32 = 1;
+pub(crate) const SHAPE_BALL: u32 = 2;
 
 /// The kinds of lights, as shaders know them.
 pub(crate) const LIGHT_SUN: u32 = 0;
@@ -143,6 +150,38 @@ impl LightParams {
     }
 }
 
+/// A medium: what it is made of, and where it is.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable)]
+pub(crate) struct MediumParams {
+    pub(crate) extinction: [f32; 4],
+    pub(crate) albedo: [f32; 4],
+    pub(crate) phase: [f32; 4],
+    pub(crate) emission: [f32; 4],
+    pub(crate) kind: [u32; 4],
+    pub(crate) unit_x: [f32; 4],
+    pub(crate) unit_y: [f32; 4],
+    pub(crate) unit_z: [f32; 4],
+}
+
+impl MediumParams {
+    /// Puts a solid where it is, in a world that begins at `origin`; nowhere if it has no volume.
+    pub(crate) fn place_solid(&mut self, world_from_unit: DAffine3, origin: DVec3) {
+        let unit_from_world = world_from_unit.inverse() * DAffine3::from_translation(origin);
+        if !world_from_unit.is_finite() || !unit_from_world.is_finite() {
+            // Far beside the unit cube and ball, wherever a ray goes.
+            (self.unit_x, self.unit_y, self.unit_z) = ([0.0, 0.0, 0.0, 8.0], [0.0; 4], [0.0; 4]);
+            return;
+        }
+        let axes = unit_from_world.matrix3.transpose();
+        let row = |axis: DVec3, last: f64| Vec4::from((axis.as_vec3(), last as f32)).to_array();
+        let last = unit_from_world.translation;
+        self.unit_x = row(axes.x_axis, last.x);
+        self.unit_y = row(axes.y_axis, last.y);
+        self.unit_z = row(axes.z_axis, last.z);
+    }
+}
+
 /// What a pass is told.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable)]
@@ -153,10 +192,6 @@ pub(crate) struct Params {
     pub(crate) up: [f32; 4],
     pub(crate) size: [u32; 4],
     pub(crate) counts: [u32; 4],
-    pub(crate) extinction: [f32; 4],
-    pub(crate) albedo: [f32; 4],
-    pub(crate) phase: [f32; 4],
-    pub(crate) emission: [f32; 4],
     pub(crate) sky_up: [f32; 4],
     pub(crate) sky_zenith: [f32; 4],
     pub(crate) sky_horizon: [f32; 4],
@@ -171,6 +206,11 @@ pub(crate) struct Params {
     pub(crate) clip_y: [f32; 4],
     pub(crate) clip_z: [f32; 4],
     pub(crate) clip_w: [f32; 4],
+    pub(crate) map_x: [f32; 4],
+    pub(crate) map_y: [f32; 4],
+    pub(crate) map_z: [f32; 4],
+    pub(crate) map_size: [u32; 4],
+    pub(crate) media: [MediumParams; MAX_MEDIA],
     pub(crate) lights: [LightParams; MAX_LIGHTS],
 }
 
@@ -207,9 +247,12 @@ mod tests {
         );
         assert_layout!(LightParams, "Light", place colour aim);
         assert_layout!(
-            Params, "Params", camera forward right up size counts extinction albedo phase emission sky_up sky_zenith
-            sky_horizon sky_ground march march_rays sun_direction sun_irradiance view tone clip_x clip_y clip_z
-            clip_w lights
+            MediumParams, "Medium", extinction albedo phase emission kind unit_x unit_y unit_z
+        );
+        assert_layout!(
+            Params, "Params", camera forward right up size counts sky_up sky_zenith sky_horizon sky_ground march
+            march_rays sun_direction sun_irradiance view tone clip_x clip_y clip_z clip_w map_x map_y map_z map_size
+            media lights
         );
     }
 }

@@ -4,16 +4,23 @@
 //! changing it allocates nothing.
 
 use std::collections::HashMap;
+use std::sync::Arc;
 
 use glam::DMat4;
-use nuage_render::scene::Spectrum;
+use nuage_render::color::Blackbody;
+use nuage_render::envmap::EnvironmentMap;
+use nuage_render::filter::Lookup;
+use nuage_render::light::Sky;
+use nuage_render::march::Quality;
+use nuage_render::path::PathSettings;
 use nuage_render::views::View;
 
 use crate::device::Gpu;
 use crate::error::GpuError;
-use crate::look::{Look, Pass, world_from_clip};
+use crate::look::{Look, Medium, MediumPlace, Pass, world_from_clip};
 use crate::params::Params;
-use crate::shader::{Features, Source, WORKGROUP_SIDE, tables};
+use crate::shader::{BLACKBODY_ROWS, Features, Source, WORKGROUP_SIDE};
+use crate::sky::{bare_sky, sky_texture};
 use crate::upload::{Volume, bind, buffer_entry, storage_entry};
 
 /// A host's depth buffer, in front of which the volume ends.
@@ -32,6 +39,10 @@ pub struct Renderer {
     size: [u32; 2],
     params: wgpu::Buffer,
     picture: wgpu::Buffer,
+    /// The radiance of black bodies, and what it holds.
+    blackbody: (wgpu::Buffer, Option<Blackbody>),
+    /// The picture of the sky that is bound, if one is.
+    sky: Option<Arc<EnvironmentMap>>,
     /// For compute passes, and for those that show the picture.
     groups: [(wgpu::BindGroupLayout, wgpu::BindGroup); 2],
     depth_layout: wgpu::BindGroupLayout,
@@ -41,6 +52,8 @@ pub struct Renderer {
     /// What the next [`Renderer::record`] runs, and whether it starts from nothing.
     prepared: Option<((Source, Features), bool)>,
     current: Params,
+    /// What of that is on the device.
+    written: Option<Params>,
 }
 
 impl Renderer {
@@ -65,15 +78,32 @@ impl Renderer {
             gpu.empty_buffer("nuage parameters", params_bytes, usage | wgpu::BufferUsages::UNIFORM)?;
         let usage = usage | wgpu::BufferUsages::COPY_SRC | wgpu::BufferUsages::STORAGE;
         let picture = gpu.empty_buffer("nuage picture", bytes, usage)?;
-        let group = |stage, is_read| {
-            let uniform = buffer_entry(0, stage, wgpu::BufferBindingType::Uniform);
-            let entries = [uniform, storage_entry(1, is_read, stage)];
-            let descriptor = wgpu::BindGroupLayoutDescriptor { label: Some("nuage pass"), entries: &entries };
-            let layout = gpu.guarded(|| gpu.device().create_bind_group_layout(&descriptor))?;
-            let bind_group = bind(gpu, "nuage pass", &layout, &[&params, &picture])?;
-            Ok::<_, GpuError>((layout, bind_group))
+        let blackbody_bytes = (BLACKBODY_ROWS * size_of::<[f32; 4]>()) as u64;
+        let usage = wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::UNIFORM;
+        let blackbody = gpu.empty_buffer("nuage black bodies", blackbody_bytes, usage)?;
+        let compute = wgpu::ShaderStages::COMPUTE;
+        let uniform = |binding, stage| buffer_entry(binding, stage, wgpu::BufferBindingType::Uniform);
+        let sky_entry = wgpu::BindGroupLayoutEntry {
+            binding: 3,
+            visibility: compute,
+            ty: wgpu::BindingType::Texture {
+                sample_type: wgpu::TextureSampleType::Float { filterable: false },
+                view_dimension: wgpu::TextureViewDimension::D2,
+                multisampled: false,
+            },
+            count: None,
         };
-        let groups = [group(wgpu::ShaderStages::COMPUTE, false)?, group(wgpu::ShaderStages::FRAGMENT, true)?];
+        let layout = |entries: &[wgpu::BindGroupLayoutEntry]| {
+            let descriptor = wgpu::BindGroupLayoutDescriptor { label: Some("nuage pass"), entries };
+            gpu.guarded(|| gpu.device().create_bind_group_layout(&descriptor))
+        };
+        let pass_layout =
+            layout(&[uniform(0, compute), storage_entry(1, false, compute), uniform(2, compute), sky_entry])?;
+        let pass_group = pass_group(gpu, &pass_layout, [&params, &picture, &blackbody], &bare_sky(gpu)?)?;
+        let fragment = wgpu::ShaderStages::FRAGMENT;
+        let show_layout = layout(&[uniform(0, fragment), storage_entry(1, true, fragment)])?;
+        let show_group = bind(gpu, "nuage pass", &show_layout, &[&params, &picture])?;
+        let groups = [(pass_layout, pass_group), (show_layout, show_group)];
         let depth_entry = wgpu::BindGroupLayoutEntry {
             binding: 0,
             visibility: wgpu::ShaderStages::COMPUTE,
@@ -92,6 +122,8 @@ impl Renderer {
             size,
             params,
             picture,
+            blackbody: (blackbody, None),
+            sky: None,
             groups,
             depth_layout,
             depth: None,
@@ -99,6 +131,7 @@ impl Renderer {
             targets: HashMap::new(),
             prepared: None,
             current: Params::default(),
+            written: None,
         })
     }
 
@@ -139,17 +172,7 @@ impl Renderer {
         source: Source,
     ) -> Result<(), GpuError> {
         let mut params = look.params(volume, pass, self.size, frame)?;
-        let (chunks, log2_chunk_words) = volume.chunks();
-        let is_lit = matches!(source, Source::March | Source::Path);
-        let features = Features {
-            codecs: volume.codecs(),
-            chunks,
-            log2_chunk_words,
-            glow_channel: look.glow.as_ref().filter(|_| is_lit).map(|(channel, _)| *channel as u32),
-            is_grey: look.is_grey() || !is_lit,
-            has_depth: depth.is_some() && is_lit,
-            encodes_srgb: false,
-        };
+        let features = features(volume, look, pass, source, depth.is_some());
         if let Some(depth) = depth {
             [params.clip_x, params.clip_y, params.clip_z, params.clip_w] =
                 world_from_clip(&depth.clip_from_world, volume.origin());
@@ -167,11 +190,8 @@ impl Renderer {
             let pipeline = self.pipeline(volume, source, &features)?;
             self.pipelines.insert(key, pipeline);
         }
-        if let Some((_, Spectrum::Blackbody { table, .. })) = &look.glow {
-            let at = 4 * tables::BLACKBODY as u64;
-            let bytes = bytemuck::cast_slice(table.table());
-            self.gpu.guarded(|| self.gpu.queue().write_buffer(volume.tables(), at, bytes))?;
-        }
+        self.write_blackbody(look)?;
+        self.bind_sky(look)?;
         let is_first = !matches!(pass, Pass::Path { sample: 1.., .. });
         self.prepared = Some((key, is_first));
         self.current = params;
@@ -207,14 +227,50 @@ impl Renderer {
     pub fn set_frame(&mut self, volume: &Volume, frame: usize) -> Result<(), GpuError> {
         check_frame(volume, frame)?;
         self.current.size[2] = frame as u32;
-        let at = (std::mem::offset_of!(Params, size) + 2 * size_of::<u32>()) as u64;
-        let bytes = (frame as u32).to_le_bytes();
-        self.gpu.guarded(|| self.gpu.queue().write_buffer(&self.params, at, &bytes))
+        self.write_params()
     }
 
-    fn write_params(&self) -> Result<(), GpuError> {
+    /// Writes of the parameters what is not on the device yet: all from the first change to the last.
+    fn write_params(&mut self) -> Result<(), GpuError> {
+        const UNIT: usize = size_of::<[f32; 4]>();
         let bytes = bytemuck::bytes_of(&self.current);
-        self.gpu.guarded(|| self.gpu.queue().write_buffer(&self.params, 0, bytes))
+        let mut range = 0..bytes.len();
+        if let Some(written) = &self.written {
+            let pairs = bytes.chunks(UNIT).zip(bytemuck::bytes_of(written).chunks(UNIT));
+            let changed: Vec<usize> =
+                pairs.enumerate().filter_map(|(i, (new, old))| (new != old).then_some(i)).collect();
+            let (Some(first), Some(last)) = (changed.first(), changed.last()) else { return Ok(()) };
+            range = first * UNIT..(last + 1) * UNIT;
+        }
+        let at = range.start as u64;
+        self.gpu.guarded(|| self.gpu.queue().write_buffer(&self.params, at, &bytes[range]))?;
+        self.written = Some(self.current);
+        Ok(())
+    }
+
+    /// Writes the table of black bodies that a look has, if it is another one.
+    fn write_blackbody(&mut self, look: &Look) -> Result<(), GpuError> {
+        let (buffer, written) = &mut self.blackbody;
+        let Some(table) = look.blackbody().filter(|table| written.as_ref() != Some(*table)) else {
+            return Ok(());
+        };
+        let bytes = bytemuck::cast_slice(table.table());
+        self.gpu.guarded(|| self.gpu.queue().write_buffer(buffer, 0, bytes))?;
+        *written = Some(table.clone());
+        Ok(())
+    }
+
+    /// Binds the picture of a look's sky, if it is another one.
+    fn bind_sky(&mut self, look: &Look) -> Result<(), GpuError> {
+        let Sky::Map(map) = &look.sky else { return Ok(()) };
+        if self.sky.as_ref().is_some_and(|bound| Arc::ptr_eq(bound, map)) {
+            return Ok(());
+        }
+        let sky = sky_texture(&self.gpu, map)?;
+        let [(layout, group), _] = &mut self.groups;
+        *group = pass_group(&self.gpu, layout, [&self.params, &self.picture, &self.blackbody.0], &sky)?;
+        self.sky = Some(map.clone());
+        Ok(())
     }
 
     fn pipeline(
@@ -322,15 +378,7 @@ impl Renderer {
         let device = self.gpu.device();
         // Eight bits hold encoded colours; formats that say so encode by themselves, and those of floats hold light.
         let is_unorm = matches!(format, wgpu::TextureFormat::Rgba8Unorm | wgpu::TextureFormat::Bgra8Unorm);
-        let features = Features {
-            codecs: 0,
-            chunks: 0,
-            log2_chunk_words: 0,
-            glow_channel: None,
-            is_grey: true,
-            has_depth: false,
-            encodes_srgb: is_unorm,
-        };
+        let features = Features { encodes_srgb: is_unorm, ..Features::BARE };
         let text = Source::Tone.text(&features);
         self.gpu.guarded(|| {
             let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
@@ -393,6 +441,55 @@ impl Renderer {
         let floats: Vec<[f32; 4]> = bytemuck::pod_collect_to_vec(&bytes);
         let share = self.current.tone[1];
         Ok(floats.into_iter().map(|pixel| pixel.map(|value| value * share)).collect())
+    }
+}
+
+/// What compute passes read and write of a renderer.
+fn pass_group(
+    gpu: &Gpu,
+    layout: &wgpu::BindGroupLayout,
+    [params, picture, blackbody]: [&wgpu::Buffer; 3],
+    sky: &wgpu::TextureView,
+) -> Result<wgpu::BindGroup, GpuError> {
+    let entry = |binding, resource| wgpu::BindGroupEntry { binding, resource };
+    let entries = [
+        entry(0, params.as_entire_binding()),
+        entry(1, picture.as_entire_binding()),
+        entry(2, blackbody.as_entire_binding()),
+        entry(3, wgpu::BindingResource::TextureView(sky)),
+    ];
+    let descriptor = wgpu::BindGroupDescriptor { label: Some("nuage pass"), layout, entries: &entries };
+    gpu.guarded(|| gpu.device().create_bind_group(&descriptor))
+}
+
+/// What the shader of a pass must be able to do.
+fn features(volume: &Volume, look: &Look, pass: &Pass, source: Source, has_depth: bool) -> Features {
+    let (chunks, log2_chunk_words) = volume.chunks();
+    let is_lit = matches!(source, Source::March | Source::Path);
+    let (lookup, sky_rays, shadow_step_voxels) = match *pass {
+        Pass::March(Quality { lookup, shadow_step_voxels, .. }) => (lookup, false, shadow_step_voxels),
+        Pass::Path { settings: PathSettings { lookup, sky_rays, .. }, .. } => (lookup, sky_rays, 1.0),
+        _ => (Lookup::Trilinear, false, 1.0),
+    };
+    let is_solid = |medium: &Medium| !matches!(medium.place, MediumPlace::Channel(_));
+    let density = look.density_channel() as u32;
+    let coarse = look.media.first().and_then(|medium| medium.coarse);
+    let has_sky_map = matches!(&look.sky, Sky::Map(map) if !map.is_black());
+    Features {
+        codecs: volume.codecs(),
+        chunks,
+        log2_chunk_words,
+        // Where nothing is, there is one medium of nothing.
+        media: look.media.len().max(1) as u32,
+        has_solids: look.media.iter().any(is_solid),
+        density_channels: [density, coarse.map_or(density, |channel| channel as u32)],
+        glow_channel: look.media.iter().find_map(Medium::glow_channel).filter(|_| is_lit),
+        is_grey: look.is_grey() || !is_lit,
+        lookup,
+        has_exact_shadows: shadow_step_voxels <= 0.0,
+        sky_map: [has_sky_map && source == Source::Path, has_sky_map && sky_rays],
+        has_depth: has_depth && is_lit,
+        encodes_srgb: false,
     }
 }
 

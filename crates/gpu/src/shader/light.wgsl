@@ -54,6 +54,9 @@ fn sample_cone(axis: vec3<f32>, spread: f32, u: vec2<f32>) -> vec3<f32> {
 }
 
 fn sky_radiance(direction: vec3<f32>) -> vec3<f32> {
+    if (HAS_SKY_MAP) {
+        return map_radiance(direction);
+    }
     let height = clamp(dot(params.sky_up.xyz, direction), -1.0, 1.0);
     let pole = select(params.sky_zenith.xyz, params.sky_ground.xyz, height < 0.0);
     let level = max(1.0 - height * height, 0.0);
