@@ -176,6 +176,9 @@ impl Look {
         for (slot, medium) in params.media.iter_mut().zip(&self.media) {
             *slot = medium.params(origin, self.blackbody());
         }
+        if let Some(table) = self.blackbody() {
+            params.blackbody.iter_mut().zip(table.table()).for_each(|(slot, row)| *slot = *row);
+        }
         match &self.sky {
             Sky::Gradient { up, zenith, horizon, ground } => {
                 params.sky_up = up.extend(0.0).to_array();

@@ -5,6 +5,7 @@
 
 use bytemuck::{Pod, Zeroable};
 use glam::{DAffine3, DVec3, IVec3, Vec3, Vec4};
+use nuage_render::color::Blackbody;
 use nuage_render::light::Light;
 use nuage_volume::channel::IndexBox;
 use nuage_volume::space::LOG2_BRICK;
@@ -13,6 +14,9 @@ use nuage_volume::space::LOG2_BRICK;
 pub const MAX_LIGHTS: usize = 16;
 /// The most volumes of a scene.
 pub const MAX_MEDIA: usize = 16;
+
+/// The temperatures of which the radiance of a black body is known.
+pub(crate) const BLACKBODY_ROWS: usize = Blackbody::STEPS + 1;
 
 /// What a medium is, as shaders know it.
 pub(crate) const SHAPE_GRID: u32 = 0;
@@ -93,8 +97,9 @@ impl Place {
             bounds_min: place(min.as_dvec3() - base, self.bounds_unit),
             bounds_max: place(max.as_dvec3() + 1.0 - base, self.floor),
             base_brick: whole(base_brick, self.cells[0]),
-            box_first: whole(min >> LOG2_BRICK, self.cells[1]),
-            box_last: whole(max >> LOG2_BRICK, 0),
+            // The widest filter reaches one voxel further than others.
+            box_first: whole(min.saturating_sub(IVec3::ONE) >> LOG2_BRICK, self.cells[1]),
+            box_last: whole(max.saturating_add(IVec3::ONE) >> LOG2_BRICK, 0),
             active_min: whole(self.active_box.min, 0),
             active_max: whole(self.active_box.max, 0),
             value: [scale, bias, most, 0.0],
@@ -184,7 +189,7 @@ impl MediumParams {
 
 /// What a pass is told.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable)]
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 pub(crate) struct Params {
     pub(crate) camera: [f32; 4],
     pub(crate) forward: [f32; 4],
@@ -212,6 +217,13 @@ pub(crate) struct Params {
     pub(crate) map_size: [u32; 4],
     pub(crate) media: [MediumParams; MAX_MEDIA],
     pub(crate) lights: [LightParams; MAX_LIGHTS],
+    pub(crate) blackbody: [[f32; 4]; BLACKBODY_ROWS],
+}
+
+impl Default for Params {
+    fn default() -> Params {
+        Params::zeroed()
+    }
 }
 
 #[cfg(test)]
@@ -252,7 +264,7 @@ mod tests {
         assert_layout!(
             Params, "Params", camera forward right up size counts sky_up sky_zenith sky_horizon sky_ground march
             march_rays sun_direction sun_irradiance view tone clip_x clip_y clip_z clip_w map_x map_y map_z map_size
-            media lights
+            media lights blackbody
         );
     }
 }

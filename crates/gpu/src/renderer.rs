@@ -7,7 +7,6 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use glam::DMat4;
-use nuage_render::color::Blackbody;
 use nuage_render::envmap::EnvironmentMap;
 use nuage_render::filter::Lookup;
 use nuage_render::light::Sky;
@@ -19,8 +18,8 @@ use crate::device::Gpu;
 use crate::error::GpuError;
 use crate::look::{Look, Medium, MediumPlace, Pass, world_from_clip};
 use crate::params::Params;
-use crate::shader::{BLACKBODY_ROWS, Features, Source, WORKGROUP_SIDE};
-use crate::sky::{bare_sky, sky_texture};
+use crate::shader::{Features, Source, WORKGROUP_SIDE};
+use crate::sky::{sky_group, sky_layout};
 use crate::upload::{Volume, bind, buffer_entry, storage_entry};
 
 /// A host's depth buffer, in front of which the volume ends.
@@ -39,14 +38,13 @@ pub struct Renderer {
     size: [u32; 2],
     params: wgpu::Buffer,
     picture: wgpu::Buffer,
-    /// The radiance of black bodies, and what it holds.
-    blackbody: (wgpu::Buffer, Option<Blackbody>),
-    /// The picture of the sky that is bound, if one is.
-    sky: Option<Arc<EnvironmentMap>>,
     /// For compute passes, and for those that show the picture.
     groups: [(wgpu::BindGroupLayout, wgpu::BindGroup); 2],
     depth_layout: wgpu::BindGroupLayout,
     depth: Option<wgpu::BindGroup>,
+    sky_layout: wgpu::BindGroupLayout,
+    /// The picture of the sky, if there was one.
+    sky: Option<(Arc<EnvironmentMap>, wgpu::BindGroup)>,
     pipelines: HashMap<(Source, Features), wgpu::ComputePipeline>,
     targets: HashMap<wgpu::TextureFormat, wgpu::RenderPipeline>,
     /// What the next [`Renderer::record`] runs, and whether it starts from nothing.
@@ -78,32 +76,15 @@ impl Renderer {
             gpu.empty_buffer("nuage parameters", params_bytes, usage | wgpu::BufferUsages::UNIFORM)?;
         let usage = usage | wgpu::BufferUsages::COPY_SRC | wgpu::BufferUsages::STORAGE;
         let picture = gpu.empty_buffer("nuage picture", bytes, usage)?;
-        let blackbody_bytes = (BLACKBODY_ROWS * size_of::<[f32; 4]>()) as u64;
-        let usage = wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::UNIFORM;
-        let blackbody = gpu.empty_buffer("nuage black bodies", blackbody_bytes, usage)?;
-        let compute = wgpu::ShaderStages::COMPUTE;
-        let uniform = |binding, stage| buffer_entry(binding, stage, wgpu::BufferBindingType::Uniform);
-        let sky_entry = wgpu::BindGroupLayoutEntry {
-            binding: 3,
-            visibility: compute,
-            ty: wgpu::BindingType::Texture {
-                sample_type: wgpu::TextureSampleType::Float { filterable: false },
-                view_dimension: wgpu::TextureViewDimension::D2,
-                multisampled: false,
-            },
-            count: None,
+        let group = |stage, is_read| {
+            let uniform = buffer_entry(0, stage, wgpu::BufferBindingType::Uniform);
+            let entries = [uniform, storage_entry(1, is_read, stage)];
+            let descriptor = wgpu::BindGroupLayoutDescriptor { label: Some("nuage pass"), entries: &entries };
+            let layout = gpu.guarded(|| gpu.device().create_bind_group_layout(&descriptor))?;
+            let bind_group = bind(gpu, "nuage pass", &layout, &[&params, &picture])?;
+            Ok::<_, GpuError>((layout, bind_group))
         };
-        let layout = |entries: &[wgpu::BindGroupLayoutEntry]| {
-            let descriptor = wgpu::BindGroupLayoutDescriptor { label: Some("nuage pass"), entries };
-            gpu.guarded(|| gpu.device().create_bind_group_layout(&descriptor))
-        };
-        let pass_layout =
-            layout(&[uniform(0, compute), storage_entry(1, false, compute), uniform(2, compute), sky_entry])?;
-        let pass_group = pass_group(gpu, &pass_layout, [&params, &picture, &blackbody], &bare_sky(gpu)?)?;
-        let fragment = wgpu::ShaderStages::FRAGMENT;
-        let show_layout = layout(&[uniform(0, fragment), storage_entry(1, true, fragment)])?;
-        let show_group = bind(gpu, "nuage pass", &show_layout, &[&params, &picture])?;
-        let groups = [(pass_layout, pass_group), (show_layout, show_group)];
+        let groups = [group(wgpu::ShaderStages::COMPUTE, false)?, group(wgpu::ShaderStages::FRAGMENT, true)?];
         let depth_entry = wgpu::BindGroupLayoutEntry {
             binding: 0,
             visibility: wgpu::ShaderStages::COMPUTE,
@@ -122,11 +103,11 @@ impl Renderer {
             size,
             params,
             picture,
-            blackbody: (blackbody, None),
-            sky: None,
             groups,
             depth_layout,
             depth: None,
+            sky_layout: sky_layout(gpu)?,
+            sky: None,
             pipelines: HashMap::new(),
             targets: HashMap::new(),
             prepared: None,
@@ -190,7 +171,6 @@ impl Renderer {
             let pipeline = self.pipeline(volume, source, &features)?;
             self.pipelines.insert(key, pipeline);
         }
-        self.write_blackbody(look)?;
         self.bind_sky(look)?;
         let is_first = !matches!(pass, Pass::Path { sample: 1.., .. });
         self.prepared = Some((key, is_first));
@@ -248,28 +228,12 @@ impl Renderer {
         Ok(())
     }
 
-    /// Writes the table of black bodies that a look has, if it is another one.
-    fn write_blackbody(&mut self, look: &Look) -> Result<(), GpuError> {
-        let (buffer, written) = &mut self.blackbody;
-        let Some(table) = look.blackbody().filter(|table| written.as_ref() != Some(*table)) else {
-            return Ok(());
-        };
-        let bytes = bytemuck::cast_slice(table.table());
-        self.gpu.guarded(|| self.gpu.queue().write_buffer(buffer, 0, bytes))?;
-        *written = Some(table.clone());
-        Ok(())
-    }
-
-    /// Binds the picture of a look's sky, if it is another one.
+    /// Takes the picture of a look's sky to the device, if it is another one.
     fn bind_sky(&mut self, look: &Look) -> Result<(), GpuError> {
         let Sky::Map(map) = &look.sky else { return Ok(()) };
-        if self.sky.as_ref().is_some_and(|bound| Arc::ptr_eq(bound, map)) {
-            return Ok(());
+        if self.sky.as_ref().is_none_or(|(bound, _)| !Arc::ptr_eq(bound, map)) {
+            self.sky = Some((map.clone(), sky_group(&self.gpu, &self.sky_layout, map)?));
         }
-        let sky = sky_texture(&self.gpu, map)?;
-        let [(layout, group), _] = &mut self.groups;
-        *group = pass_group(&self.gpu, layout, [&self.params, &self.picture, &self.blackbody.0], &sky)?;
-        self.sky = Some(map.clone());
         Ok(())
     }
 
@@ -287,10 +251,12 @@ impl Renderer {
                 source: wgpu::ShaderSource::Wgsl(text.into()),
             });
             let [(pass_layout, _), _] = &self.groups;
-            let mut layouts = vec![Some(volume.layout()), Some(pass_layout)];
-            if features.has_depth {
-                layouts.push(Some(&self.depth_layout));
-            }
+            let layouts = [
+                Some(volume.layout()),
+                Some(pass_layout),
+                features.has_depth.then_some(&self.depth_layout),
+                features.sky_map[0].then_some(&self.sky_layout),
+            ];
             let layout = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
                 label: Some(source.entry_point()),
                 bind_group_layouts: &layouts,
@@ -326,6 +292,9 @@ impl Renderer {
         pass.set_bind_group(1, group, &[]);
         if let Some(depth) = self.depth.as_ref().filter(|_| key.1.has_depth) {
             pass.set_bind_group(2, depth, &[]);
+        }
+        if let Some((_, sky)) = self.sky.as_ref().filter(|_| key.1.sky_map[0]) {
+            pass.set_bind_group(3, sky, &[]);
         }
         let [x, y] = self.size.map(|side| side.div_ceil(WORKGROUP_SIDE));
         pass.dispatch_workgroups(x, y, 1);
@@ -442,24 +411,6 @@ impl Renderer {
         let share = self.current.tone[1];
         Ok(floats.into_iter().map(|pixel| pixel.map(|value| value * share)).collect())
     }
-}
-
-/// What compute passes read and write of a renderer.
-fn pass_group(
-    gpu: &Gpu,
-    layout: &wgpu::BindGroupLayout,
-    [params, picture, blackbody]: [&wgpu::Buffer; 3],
-    sky: &wgpu::TextureView,
-) -> Result<wgpu::BindGroup, GpuError> {
-    let entry = |binding, resource| wgpu::BindGroupEntry { binding, resource };
-    let entries = [
-        entry(0, params.as_entire_binding()),
-        entry(1, picture.as_entire_binding()),
-        entry(2, blackbody.as_entire_binding()),
-        entry(3, wgpu::BindingResource::TextureView(sky)),
-    ];
-    let descriptor = wgpu::BindGroupDescriptor { label: Some("nuage pass"), layout, entries: &entries };
-    gpu.guarded(|| gpu.device().create_bind_group(&descriptor))
 }
 
 /// What the shader of a pass must be able to do.

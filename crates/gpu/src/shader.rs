@@ -18,8 +18,6 @@ use crate::params::{self, MAX_LIGHTS, MAX_MEDIA};
 
 /// Pixels along each side of a workgroup.
 pub(crate) const WORKGROUP_SIDE: u32 = 8;
-/// The temperatures of which the radiance of a black body is known.
-pub(crate) const BLACKBODY_ROWS: usize = Blackbody::STEPS + 1;
 /// The tag of an entry that is not there.
 const ABSENT_TAG: u32 = 254;
 /// The words in front of the arrays of trees that say where each begins.
@@ -221,6 +219,7 @@ impl Source {
             step: "if (is_active(field, voxel)) { *state += in_region(field, region, voxel) * (t1 - t0); }",
             empty: "",
         });
+        let sky_map = if features.sky_map[0] { file!("envmap") } else { file!("even_sky") };
         let media = if features.is_one_grid() { file!("one_grid") } else { file!("media") };
         let own: &[&str] = match self {
             Source::Views => {
@@ -241,7 +240,7 @@ impl Source {
                 file!("emission"),
                 end,
                 file!("light"),
-                file!("envmap"),
+                sky_map,
                 file!("solid"),
                 file!("track"),
                 media,
@@ -421,7 +420,7 @@ fn prelude(features: &Features) -> String {
     p.f("COLDEST_KELVIN", Blackbody::COLDEST_KELVIN);
     p.f("HOTTEST_KELVIN", Blackbody::HOTTEST_KELVIN);
     p.f("BLACKBODY_STEPS", Blackbody::STEPS as f32);
-    p.u("BLACKBODY_ROWS", BLACKBODY_ROWS);
+    p.u("BLACKBODY_ROWS", params::BLACKBODY_ROWS);
 
     p.u("LOG2_BRICK", LOG2_BRICK);
     p.u("LOG2_NODE4_BRICKS", LOG2_NODE4_BRICKS);
@@ -502,11 +501,13 @@ fn prelude(features: &Features) -> String {
     p.u("MEDIA", features.media);
     p.b("HAS_SOLIDS", features.has_solids);
     p.f("ENVIRONMENT_PARTS", envmap::PARTS as f32);
-    p.b("HAS_SKY_MAP", features.sky_map[0]);
     p.b("HAS_SKY_RAYS", features.sky_map[1]);
     LOOKUPS.iter().for_each(|(lookup, name)| p.u(name, lookup_number(*lookup)));
     p.u("LOOKUP", lookup_number(features.lookup));
     p.u("MEAN_LOOKUP", lookup_number(features.lookup.mean()));
+    let is_wide = features.lookup.mean() == Lookup::Tricubic;
+    p.b("IS_WIDE", is_wide);
+    p.f("REACH", f32::from(u8::from(is_wide)));
     p.u("DENSITY_CHANNEL", features.density_channels[0]);
     p.u("SHADOW_CHANNEL", features.density_channels[1]);
     p.u("GLOW_CHANNEL", features.glow_channel.unwrap_or(0));

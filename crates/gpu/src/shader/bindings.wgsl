@@ -84,12 +84,11 @@ struct Params {
     map_size: vec4<u32>,
     media: array<Medium, MAX_MEDIA>,
     lights: array<Light, MAX_LIGHTS>,
+    // Of black bodies by their temperature: colour of luminance 1, and the logarithm of the luminance.
+    blackbody: array<vec4<f32>, BLACKBODY_ROWS>,
 }
 
 @group(0) @binding(0) var<storage, read> tree: array<u32>;
 @group(0) @binding(1) var<storage, read> fields: array<Field>;
 @group(0) @binding(2) var<storage, read> tables: array<u32>;
 @group(1) @binding(0) var<uniform> params: Params;
-// Of black bodies by their temperature: colour of luminance 1, and the logarithm of the luminance.
-@group(1) @binding(2) var<uniform> blackbody: array<vec4<f32>, BLACKBODY_ROWS>;
-@group(1) @binding(3) var sky_map: texture_2d<f32>;

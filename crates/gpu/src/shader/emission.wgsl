@@ -12,8 +12,8 @@ fn spectrum_radiance(emission: vec4<f32>, value: f32) -> vec3<f32> {
     let cold = 1.0 / COLDEST_KELVIN;
     let position = max(1.0 / kelvin - hot, 0.0) * (BLACKBODY_STEPS / (cold - hot));
     let index = min(floor(position), BLACKBODY_STEPS - 1.0);
-    let a = blackbody[u32(index)];
-    let b = blackbody[u32(index) + 1u];
+    let a = params.blackbody[u32(index)];
+    let b = params.blackbody[u32(index) + 1u];
     let row = a + (b - a) * (position - index);
     return row.xyz * exp_(row.w) * emission.x;
 }

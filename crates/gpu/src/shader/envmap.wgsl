@@ -1,5 +1,7 @@
 // Light by direction from a picture of all surroundings: nuage_render::envmap. Where its texels stand is told in `crate::sky`.
 
+@group(3) @binding(0) var sky_map: texture_2d<f32>;
+
 fn sky_texel(x: u32, y: u32) -> vec4<f32> {
     return textureLoad(sky_map, vec2<u32>(x, y), 0);
 }
@@ -38,7 +40,7 @@ fn map_from_world(direction: vec3<f32>) -> vec3<f32> {
     );
 }
 
-fn map_radiance(direction: vec3<f32>) -> vec3<f32> {
+fn sky_radiance(direction: vec3<f32>) -> vec3<f32> {
     return map_bilinear(map_position(map_from_world(direction)));
 }
 
@@ -102,4 +104,23 @@ fn direction_in_texel(x: u32, y: u32, inside: vec2<f32>) -> vec3<f32> {
     let up = select(1.0 - from_pole, from_pole - 1.0, is_lower);
     let turned = sin_cos_turns(0.5 - (f32(x) + inside.x) / f32(size.x));
     return vec3<f32>(across * turned.x, up, across * turned.y);
+}
+
+// The light of a picture of the surroundings that a point scatters along `before`, over the share of light that it scatters at
+// all: from a direction that the picture or the phase function chose.
+fn mapped(phase: Phase, at: vec3<f32>, before: vec3<f32>, random: ptr<function, Random>) -> vec3<f32> {
+    let takes_map = random_unit(random) < 0.5;
+    let u = vec2<f32>(random_unit(random), random_unit(random));
+    var direction: vec3<f32>;
+    if (takes_map) {
+        direction = sample_map(u);
+    } else {
+        direction = sample_phase(phase, before, u);
+    }
+    let scatters = phase_between(phase, before, direction);
+    let density = 0.5 * (scatters + map_pdf(direction));
+    if (density <= 0.0) {
+        return vec3<f32>(0.0);
+    }
+    return sky_radiance(direction) * (scatters / density) * transmittance(Ray(at, direction), MAX_F32, random);
 }

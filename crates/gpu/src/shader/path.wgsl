@@ -41,25 +41,6 @@ fn light_at(
     return arrives.light * scatters * transmittance(Ray(at, direction), limit, random);
 }
 
-// The light of a picture of the surroundings that a point scatters along `before`, over the share of light that it scatters at
-// all: from a direction that the picture or the phase function chose.
-fn mapped(phase: Phase, at: vec3<f32>, before: vec3<f32>, random: ptr<function, Random>) -> vec3<f32> {
-    let takes_map = random_unit(random) < 0.5;
-    let u = vec2<f32>(random_unit(random), random_unit(random));
-    var direction: vec3<f32>;
-    if (takes_map) {
-        direction = sample_map(u);
-    } else {
-        direction = sample_phase(phase, before, u);
-    }
-    let scatters = phase_between(phase, before, direction);
-    let density = 0.5 * (scatters + map_pdf(direction));
-    if (density <= 0.0) {
-        return vec3<f32>(0.0);
-    }
-    return map_radiance(direction) * (scatters / density) * transmittance(Ray(at, direction), MAX_F32, random);
-}
-
 // The light that one path finds along a ray, and whether it met the medium.
 fn path_light(first: Ray, limit: f32, seed: u32) -> vec4<f32> {
     var random = Random(seed, 0u);
