@@ -4,6 +4,7 @@
 //! changing it allocates nothing.
 
 use std::collections::HashMap;
+use std::ops::Range;
 use std::sync::Arc;
 
 use glam::DMat4;
@@ -212,15 +213,13 @@ impl Renderer {
 
     /// Writes of the parameters what is not on the device yet: all from the first change to the last.
     fn write_params(&mut self) -> Result<(), GpuError> {
-        const UNIT: usize = size_of::<[f32; 4]>();
         let bytes = bytemuck::bytes_of(&self.current);
-        let mut range = 0..bytes.len();
-        if let Some(written) = &self.written {
-            let pairs = bytes.chunks(UNIT).zip(bytemuck::bytes_of(written).chunks(UNIT));
-            let changed: Vec<usize> =
-                pairs.enumerate().filter_map(|(i, (new, old))| (new != old).then_some(i)).collect();
-            let (Some(first), Some(last)) = (changed.first(), changed.last()) else { return Ok(()) };
-            range = first * UNIT..(last + 1) * UNIT;
+        let range = match &self.written {
+            Some(written) => changed(bytes, bytemuck::bytes_of(written)),
+            None => 0..bytes.len(),
+        };
+        if range.is_empty() {
+            return Ok(());
         }
         let at = range.start as u64;
         self.gpu.guarded(|| self.gpu.queue().write_buffer(&self.params, at, &bytes[range]))?;
@@ -444,9 +443,39 @@ fn features(volume: &Volume, look: &Look, pass: &Pass, source: Source, has_depth
     }
 }
 
+/// Where bytes differ from others of the same count, from the first change to the last, in whole vectors of four floats.
+fn changed(new: &[u8], old: &[u8]) -> Range<usize> {
+    const UNIT: usize = size_of::<[f32; 4]>();
+    let is_changed = |i: &usize| new.chunks(UNIT).nth(*i) != old.chunks(UNIT).nth(*i);
+    let units = 0..new.len().div_ceil(UNIT);
+    match (units.clone().find(is_changed), units.rev().find(is_changed)) {
+        (Some(first), Some(last)) => first * UNIT..new.len().min((last + 1) * UNIT),
+        _ => 0..0,
+    }
+}
+
 fn check_frame(volume: &Volume, frame: usize) -> Result<(), GpuError> {
     match frame < volume.frames() {
         true => Ok(()),
         false => Err(GpuError::Misuse(format!("frame {frame} of {}", volume.frames()))),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_changes_is_found() {
+        let old = [7; 80];
+        let with = |places: &[usize]| {
+            let mut new = old;
+            places.iter().for_each(|place| new[*place] = 8);
+            changed(&new, &old)
+        };
+        assert_eq!(with(&[]), 0..0);
+        assert_eq!(with(&[0]), 0..16);
+        assert_eq!(with(&[17, 50]), 16..64);
+        assert_eq!(with(&[79]), 64..80);
     }
 }

@@ -96,7 +96,9 @@ fn hold(name: &str, ours: &[Estimate], theirs: &[Estimate]) {
         let means = [ours, theirs].map(|picture| sum(&|pixel| pixel.mean, picture) / count);
         let variance: f64 =
             [ours, theirs].map(|p| sum(&|pixel| pixel.variance, p)).iter().sum::<f64>() / count.powi(2);
-        (means, (means[0] - means[1]).abs() / (variance + floor.powi(2)).sqrt())
+        // Where there is no light, both are 0.
+        let error = (variance + floor.powi(2)).sqrt().max(f64::MIN_POSITIVE);
+        (means, (means[0] - means[1]).abs() / error)
     };
     let all: Vec<usize> = (0..ours.len()).collect();
     let ([found, expected], off) = over(&all, 1e-3 * expected_floor(theirs));
