@@ -355,7 +355,8 @@ impl Arrays {
 
     /// How many frames there are.
     pub fn frames(&self) -> usize {
-        self.places.len().checked_div(self.channels).unwrap_or(0)
+        // Without channels, nothing is in one frame.
+        self.places.len().checked_div(self.channels).unwrap_or(1)
     }
 
     /// The bytes of trees, and of bricks and shapes.
@@ -371,9 +372,9 @@ impl Arrays {
         self.origin
     }
 
-    /// Where a channel is in a frame.
-    pub(crate) fn place(&self, frame: usize, channel: usize) -> Option<&Place> {
-        self.places.get(frame * self.channels + channel)?.as_ref()
+    /// Where each channel is, frame by frame.
+    pub(crate) fn places(&self) -> &[Option<Place>] {
+        &self.places
     }
 
     /// The largest value of a channel in all frames.

@@ -19,6 +19,7 @@ mod params;
 pub mod picture;
 pub mod renderer;
 mod shader;
+mod sky;
 pub mod upload;
 
 #[cfg(test)]

@@ -5,6 +5,7 @@ use glam::{DVec3, Vec3};
 use nuage_render::camera::Camera;
 use nuage_render::hash::{hash_pixel, hash_u32, unit_f32};
 use nuage_render::light::Sky;
+use nuage_render::path::PathSettings;
 use nuage_render::phase::Phase;
 use nuage_render::{color, math, views};
 use nuage_volume::brick::f32_from_finite_f16;
@@ -41,17 +42,10 @@ fn run(gpu: &Gpu, volume: &Volume, rows: &[Vec<[f32; 4]>]) -> Vec<Vec<[f32; 4]>>
     let size = [COUNT, rows.len() as u32];
     let mut renderer = crate::renderer::Renderer::new(gpu, size).expect("a renderer");
     let camera = Camera::look_at(DVec3::Z, DVec3::ZERO, DVec3::Y, 40.0).expect("a view");
-    let phase = Phase::HenyeyGreenstein { g: 0.0 };
-    let look = Look {
-        camera,
-        extinction: [1.0; 3],
-        albedo: [1.0; 3],
-        phase,
-        glow: None,
-        lights: Vec::new(),
-        sky: Sky::Constant([0.0; 3]),
-    };
-    renderer.prepare_source(volume, &look, &Pass::Hits, Source::Twins).expect("a pipeline");
+    let look = Look { camera, media: Vec::new(), lights: Vec::new(), sky: Sky::Constant([0.0; 3]) };
+    // Of all passes, paths ask the least of a look.
+    let pass = Pass::Path { settings: PathSettings::default(), sample: 0 };
+    renderer.prepare_source(volume, &look, &pass, Source::Twins).expect("a pipeline");
     renderer.write_pixels(&rows.concat()).expect("pixels written");
     renderer.run(volume).expect("a run");
     let pixels = renderer.pixels().expect("pixels read");

@@ -19,7 +19,6 @@ const MAX_CHUNKS: u64 = 4;
 pub struct Volume {
     layout: wgpu::BindGroupLayout,
     bind_group: wgpu::BindGroup,
-    tables: wgpu::Buffer,
     arrays: Summary,
     chunks: u32,
     log2_chunk_words: u32,
@@ -33,9 +32,9 @@ struct Summary {
     codecs: u32,
     frames: usize,
     channels: usize,
-    /// Of the first channel.
-    largest: f32,
-    /// Of the first channel.
+    /// Of each channel.
+    largest: Vec<f32>,
+    /// Of each channel, frame by frame.
     places: Vec<Option<Place>>,
 }
 
@@ -106,14 +105,13 @@ impl Volume {
         Ok(Volume {
             layout,
             bind_group,
-            tables,
             arrays: Summary {
                 origin: arrays.origin(),
                 codecs: arrays.codecs(),
                 frames: arrays.frames(),
                 channels: arrays.channels(),
-                largest: arrays.largest(0),
-                places: (0..arrays.frames()).map(|frame| arrays.place(frame, 0).copied()).collect(),
+                largest: (0..arrays.channels()).map(|channel| arrays.largest(channel)).collect(),
+                places: arrays.places().to_vec(),
             },
             chunks: chunks as u32,
             log2_chunk_words,
@@ -148,10 +146,6 @@ impl Volume {
         &self.bind_group
     }
 
-    pub(crate) fn tables(&self) -> &wgpu::Buffer {
-        &self.tables
-    }
-
     /// Where the world of shaders begins.
     pub(crate) fn origin(&self) -> DVec3 {
         self.arrays.origin
@@ -166,14 +160,14 @@ impl Volume {
         (self.chunks, self.log2_chunk_words)
     }
 
-    /// The largest value of the first channel.
-    pub(crate) fn largest(&self) -> f32 {
-        self.arrays.largest
+    /// The largest value of a channel in all frames.
+    pub(crate) fn largest(&self, channel: usize) -> f32 {
+        self.arrays.largest.get(channel).copied().unwrap_or(0.0)
     }
 
-    /// Where the first channel is in a frame.
-    pub(crate) fn place(&self, frame: usize) -> Option<&Place> {
-        self.arrays.places.get(frame)?.as_ref()
+    /// Where a channel is in a frame.
+    pub(crate) fn place(&self, frame: usize, channel: usize) -> Option<&Place> {
+        self.arrays.places.get(frame * self.arrays.channels + channel)?.as_ref()
     }
 }
 

@@ -39,11 +39,11 @@ fn frames_are_switched_by_a_number() {
     let mut renderer = common::renderer(&gpu);
     let mut look = Look::of_scene(&scenes[0]).expect("a look");
     let quality = Quality { step_voxels: 2.0, shadow_step_voxels: 4.0, sky_rays: 0, ..Quality::default() };
-    look.extinction = scenes[0].volumes[0].extinction;
+    look.media[0].extinction = scenes[0].volumes[0].extinction;
     let march = |frame: usize| {
         let mut scene = scenes[frame].clone();
         scene.camera = scenes[0].camera;
-        scene.volumes[0].extinction = look.extinction;
+        scene.volumes[0].extinction = look.media[0].extinction;
         nuage_render::picture::render(&scene, quality, SIZE[0], SIZE[1], &|_, _| ())
             .expect("a picture")
             .pixels
@@ -226,7 +226,7 @@ fn what_makes_no_sense_is_an_error() {
     let volume = uploaded(&gpu, &[&channel]);
     let scene = lit(&channel);
     let mut look = Look::of_scene(&scene).expect("a look");
-    look.extinction = [1.0, 2.0, 3.0];
+    look.media[0].extinction = [1.0, 2.0, 3.0];
     let mut renderer = common::renderer(&gpu);
     let prepared = renderer.prepare(&volume, &look, &Pass::March(Quality::default()), 0, None);
     assert!(matches!(prepared, Err(GpuError::Unsupported { .. })), "{prepared:?}");
