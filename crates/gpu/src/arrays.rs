@@ -21,8 +21,12 @@ use nuage_volume::packed::{Content, Entry, Node, RootCell, TreeRef, Trees, mask}
 use nuage_volume::space::{BRICK_VOXELS, NODE4_SLOTS, NODE5_SLOTS};
 
 use crate::error::GpuError;
+use crate::maps;
 use crate::params::{Field, Place};
 use crate::shader::{HEADER_WORDS, codec_bit};
+
+/// Maps of bricks take at most this part of the bytes of trees and bricks: a look-up is then worth its memory.
+const MAP_SHARE: usize = 8;
 
 /// In which form bricks are kept on the device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -82,6 +86,9 @@ pub struct Arrays {
     channels: usize,
     codecs: u32,
     origin: DVec3,
+    /// Flat maps of bricks, and where that of each place begins; empty if they would be large beside the rest.
+    maps: Vec<u32>,
+    first_map_words: Vec<u32>,
 }
 
 /// Of which kind a node is.
@@ -346,6 +353,52 @@ impl Arrays {
             corners.fold((DVec3::ZERO, 0.0), |(sum, count), corner| (sum + corner, count + 1.0));
         let middle = sum / f64::max(count, 1.0);
         self.origin = if middle.is_finite() { middle } else { DVec3::ZERO };
+        self.make_maps();
+    }
+
+    /// Makes maps of all places, unless they take more than a part of what stands there already.
+    fn make_maps(&mut self) {
+        let [trees, bricks] = self.size_bytes();
+        let boxes: Vec<[IVec3; 2]> = self.places.iter().flatten().map(Place::bricks).collect();
+        let counts = boxes.iter().map(|[first, last]| maps::cell_count(*first, *last));
+        let cells = counts.sum::<Option<usize>>().and_then(|count| count.checked_mul(4 * maps::CELL_WORDS));
+        if cells.is_none_or(|bytes| bytes > (trees + bricks) / MAP_SHARE) {
+            return;
+        }
+        // Frames of the same tree share a map.
+        let mut known: HashMap<([u32; 2], [IVec3; 2]), u32> = HashMap::new();
+        let mut words = Vec::new();
+        let mut firsts = Vec::with_capacity(self.places.len());
+        for place in &self.places {
+            let Some(place) = place else {
+                firsts.push(0);
+                continue;
+            };
+            let key = (place.cells, place.bricks());
+            let first = match known.get(&key) {
+                Some(first) => *first,
+                None => {
+                    let [low, high] = place.bricks();
+                    let Some(map) = maps::map(&self.trees, place.cells, low, high) else { return };
+                    let first = words.len() as u32;
+                    words.extend(map);
+                    known.insert(key, first);
+                    first
+                }
+            };
+            firsts.push(first);
+        }
+        (self.maps, self.first_map_words) = (words, firsts);
+    }
+
+    /// Whether all values mean themselves.
+    pub(crate) fn are_densities(&self) -> bool {
+        self.places.iter().flatten().all(|place| place.meaning == Meaning::Density.line())
+    }
+
+    /// Whether all fields have a map.
+    pub(crate) fn has_maps(&self) -> bool {
+        !self.maps.is_empty()
     }
 
     /// How many channels each frame has.
@@ -387,13 +440,17 @@ impl Arrays {
         let field =
             |place: &Option<Place>| place.as_ref().map_or_else(Field::default, |p| p.field(self.origin));
         let mut fields: Vec<Field> = self.places.iter().map(field).collect();
+        let trees_words = HEADER_WORDS + self.trees.size_bytes() / 4;
+        for (field, first) in fields.iter_mut().zip(&self.first_map_words) {
+            field.box_last[3] = (trees_words + *first as usize) as i32;
+        }
         if fields.is_empty() {
             fields.push(Field::default());
         }
         fields
     }
 
-    /// The trees in one array of words, which begins by saying where each of them does.
+    /// The trees in one array of words, which begins by saying where each of them does, and the maps behind them.
     pub(crate) fn tree_words(&self) -> Vec<u32> {
         let Trees { cells, node5s, node4s, entries, masks } = &self.trees;
         let arrays: [&[u32]; 5] = [
@@ -413,6 +470,7 @@ impl Arrays {
         words.extend([self.words.len() as u32, self.channels as u32]);
         words.resize(HEADER_WORDS, 0);
         arrays.iter().for_each(|array| words.extend_from_slice(array));
+        words.extend_from_slice(&self.maps);
         words
     }
 

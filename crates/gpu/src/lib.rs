@@ -15,6 +15,7 @@ pub mod arrays;
 pub mod device;
 pub mod error;
 pub mod look;
+mod maps;
 mod params;
 pub mod picture;
 pub mod renderer;

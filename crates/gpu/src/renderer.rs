@@ -137,7 +137,7 @@ impl Renderer {
         check_frame(volume, frame)?;
         let source = match pass {
             Pass::View(View::Surface { .. }) | Pass::SurfaceHits { .. } => Source::Surface,
-            Pass::View(_) | Pass::Hits => Source::Views,
+            Pass::View(_) | Pass::Hits { .. } | Pass::Opacity { .. } => Source::Views,
             Pass::March(_) => Source::March,
             Pass::Path { .. } => Source::Path,
         };
@@ -154,7 +154,7 @@ impl Renderer {
         source: Source,
     ) -> Result<(), GpuError> {
         let mut params = look.params(volume, pass, self.size, frame)?;
-        let features = features(volume, look, pass, source, depth.is_some());
+        let features = features(volume, look, pass, source, depth.is_some(), params.counts[2]);
         if let Some(depth) = depth {
             [params.clip_x, params.clip_y, params.clip_z, params.clip_w] =
                 world_from_clip(&depth.clip_from_world, volume.origin());
@@ -270,6 +270,11 @@ impl Renderer {
                 cache: None,
             })
         })
+    }
+
+    /// The WGSL of what was prepared, for programs that say what a device would make of it.
+    pub fn shader(&self) -> Option<String> {
+        self.prepared.map(|((source, features), _)| source.text(&features))
     }
 
     /// Records what was prepared into an encoder: the picture is there once that is submitted and done.
@@ -413,7 +418,14 @@ impl Renderer {
 }
 
 /// What the shader of a pass must be able to do.
-fn features(volume: &Volume, look: &Look, pass: &Pass, source: Source, has_depth: bool) -> Features {
+fn features(
+    volume: &Volume,
+    look: &Look,
+    pass: &Pass,
+    source: Source,
+    has_depth: bool,
+    view: u32,
+) -> Features {
     let (chunks, log2_chunk_words) = volume.chunks();
     let is_lit = matches!(source, Source::March | Source::Path);
     let (lookup, sky_rays, shadow_step_voxels) = match *pass {
@@ -439,6 +451,9 @@ fn features(volume: &Volume, look: &Look, pass: &Pass, source: Source, has_depth
         has_exact_shadows: shadow_step_voxels <= 0.0,
         sky_map: [has_sky_map && source == Source::Path, has_sky_map && sky_rays],
         has_depth: has_depth && is_lit,
+        has_maps: volume.has_maps(),
+        are_densities: volume.are_densities(),
+        view: if is_lit { 0 } else { view },
         encodes_srgb: false,
     }
 }

@@ -14,12 +14,11 @@ use nuage_volume::codec::{self, Codec, bounds, sparse};
 use nuage_volume::packed::{Entry, RootCell};
 use nuage_volume::space::{LOG2_BRICK, LOG2_NODE4_BRICKS, LOG2_NODE5_BRICKS, NODE4_SLOTS, NODE5_SLOTS};
 
+use crate::maps::{self, ABSENT_TAG};
 use crate::params::{self, MAX_LIGHTS, MAX_MEDIA};
 
 /// Pixels along each side of a workgroup.
 pub(crate) const WORKGROUP_SIDE: u32 = 8;
-/// The tag of an entry that is not there.
-const ABSENT_TAG: u32 = 254;
 /// The words in front of the arrays of trees that say where each begins.
 pub(crate) const HEADER_WORDS: usize = 8;
 
@@ -50,6 +49,12 @@ pub(crate) struct Features {
     pub(crate) sky_map: [bool; 2],
     /// Whether rays end at a host's depth buffer.
     pub(crate) has_depth: bool,
+    /// Whether bricks are looked up in maps.
+    pub(crate) has_maps: bool,
+    /// Whether all values mean themselves.
+    pub(crate) are_densities: bool,
+    /// What a view shows. Others have none.
+    pub(crate) view: u32,
     /// Whether a target takes encoded colours.
     pub(crate) encodes_srgb: bool,
 }
@@ -69,6 +74,9 @@ impl Features {
         has_exact_shadows: false,
         sky_map: [false, false],
         has_depth: false,
+        has_maps: false,
+        are_densities: true,
+        view: 0,
         encodes_srgb: false,
     };
 
@@ -87,6 +95,9 @@ impl Features {
         has_exact_shadows: true,
         sky_map: [true, true],
         has_depth: false,
+        has_maps: true,
+        are_densities: false,
+        view: 0,
         encodes_srgb: true,
     };
 
@@ -114,8 +125,8 @@ fn lookup_number(lookup: Lookup) -> u32 {
 }
 
 /// The kinds of codecs of which decoders can be left out.
-const CODEC_KINDS: [&str; 9] =
-    ["F32", "F16", "UNIFORM", "SPARSE", "SPLIT", "BLOCK", "LATTICE", "GRADIENT", "SHARED"];
+const CODEC_KINDS: [&str; 10] =
+    ["F32", "F16", "UNIFORM", "SPARSE", "SPLIT", "BLOCK", "LATTICE", "GRADIENT", "SHARED", "UNEVEN"];
 
 /// The bit of a codec's kind.
 pub(crate) fn codec_bit(codec: Codec) -> u32 {
@@ -123,6 +134,8 @@ pub(crate) fn codec_bit(codec: Codec) -> u32 {
         Codec::Constant => return 0,
         Codec::F32 => 0,
         Codec::F16 => 1,
+        // Codes that reach over the ends of words are a kind of their own.
+        Codec::Uniform { bits } if u32::BITS % u32::from(bits) != 0 => return 1 << 2 | 1 << 9,
         Codec::Uniform { .. } => 2,
         Codec::Sparse { .. } => 3,
         Codec::Split { .. } => 4,
@@ -159,7 +172,7 @@ macro_rules! file {
 }
 
 /// What all but [`Source::Tone`] begin with.
-const COMMON: [&str; 10] = [
+const COMMON: [&str; 11] = [
     file!("math"),
     file!("hash"),
     file!("phase"),
@@ -168,6 +181,7 @@ const COMMON: [&str; 10] = [
     file!("tree"),
     file!("block"),
     file!("codec"),
+    file!("brick"),
     file!("filter"),
     file!("walk"),
 ];
@@ -201,30 +215,56 @@ impl Source {
         text += &brick_words(features);
         COMMON.iter().for_each(|part| text += part);
         let end = if features.has_depth { file!("depth_end") } else { file!("open_end") };
-        let first_voxel = hdda(&Body {
-            name: "meet_voxel",
-            state: "VoxelHit",
-            layer: Layer::Voxel,
-            step: "let value = in_region(field, region, voxel);
-            if (value > 0.0 && is_active(field, voxel)) {
-                *state = VoxelHit(true, t0, voxel, value);
+        let first_voxel = hdda(
+            features,
+            &Body {
+                name: "meet_voxel",
+                state: "VoxelHit",
+                layer: Layer::Voxel,
+                enter: "",
+                step: "if (value > (*state).above && t0 < t1) {
+                *state = VoxelHit(true, (*state).above, t0, brick, cell, value);
                 return;
             }",
-            empty: "",
-        });
-        let voxel_depth = hdda(&Body {
-            name: "add_voxels",
-            state: "f32",
-            layer: Layer::Voxel,
-            step: "if (is_active(field, voxel)) { *state += in_region(field, region, voxel) * (t1 - t0); }",
-            empty: "",
-        });
+                empty: "",
+            },
+        );
+        let nearest_steps = hdda(
+            features,
+            &Body {
+                name: "pass_voxels",
+                state: "Passing",
+                layer: Layer::Voxel,
+                enter: "(*state).number = ceil(t0 * (*state).per_step);",
+                step: "let next = ceil(t1 * (*state).per_step);
+                (*state).share *= short_power(1.0 - (*state).loss * value, next - (*state).number);
+                (*state).number = next;",
+                empty: "",
+            },
+        );
+        let voxel_depth = hdda(
+            features,
+            &Body {
+                name: "add_voxels",
+                state: "f32",
+                layer: Layer::Voxel,
+                enter: "",
+                step: "*state += value * max(t1 - t0, 0.0);",
+                empty: "",
+            },
+        );
         let sky_map = if features.sky_map[0] { file!("envmap") } else { file!("even_sky") };
         let media = if features.is_one_grid() { file!("one_grid") } else { file!("media") };
         let own: &[&str] = match self {
-            Source::Views => {
-                &[file!("camera"), file!("cells"), file!("depth"), file!("views"), &first_voxel, &voxel_depth]
-            }
+            Source::Views => &[
+                file!("camera"),
+                file!("cells"),
+                file!("depth"),
+                file!("views"),
+                &first_voxel,
+                &voxel_depth,
+                &nearest_steps,
+            ],
             Source::Surface => &[file!("camera"), file!("cells"), file!("surface")],
             Source::March => &[
                 file!("camera"),
@@ -265,12 +305,15 @@ enum Layer {
     Voxel,
 }
 
-/// What a walk does: WGSL that sees `field`, `ray`, `brick`, `region`, `voxel`, `t0`, `t1` and `state`.
+/// What a walk does: WGSL that sees `field`, `ray`, `brick`, `region`, `cell`, `value`,
+/// `t0`, `t1` and `state`.
 struct Body<'a> {
     name: &'a str,
     /// The type that `state` points to.
     state: &'a str,
     layer: Layer,
+    /// Where a brick begins, before its steps; it does not see `cell` and `value`.
+    enter: &'a str,
     /// At each step; `return;` ends the walk.
     step: &'a str,
     /// In each empty region.
@@ -278,16 +321,17 @@ struct Body<'a> {
 }
 
 /// A walk with its body put in, so that nothing is called.
-fn hdda(body: &Body<'_>) -> String {
+fn hdda(features: &Features, body: &Body<'_>) -> String {
     let layer = match body.layer {
         #[cfg(test)]
         Layer::Brick => "BRICK_LAYER",
         Layer::Voxel => "VOXEL_LAYER",
     };
-    file!("hdda")
-        .replace("$NAME", body.name)
+    let walk = if features.has_maps { file!("hdda_map") } else { file!("hdda") };
+    walk.replace("$NAME", body.name)
         .replace("$STATE", body.state)
         .replace("$LAYER", layer)
+        .replace("$ENTER", body.enter)
         .replace("$STEP", body.step)
         .replace("$EMPTY", body.empty)
 }
@@ -437,6 +481,12 @@ fn prelude(features: &Features) -> String {
         p.u(name, i);
     }
     p.u("ABSENT_TAG", ABSENT_TAG);
+    p.u("NODE4_TILE_TAG", maps::TILE_TAGS[0]);
+    p.u("NODE5_TILE_TAG", maps::TILE_TAGS[1]);
+    p.u("MAP_CELL_WORDS", maps::CELL_WORDS);
+    p.u("VIEW", features.view);
+    p.b("ARE_DENSITIES", features.are_densities);
+    p.b("HAS_MAPS", features.has_maps);
     p.u("NODE_TAG", Entry::NODE);
     p.u("CONSTANT_TAG", Codec::Constant.tag());
     p.u("BOUND_SIGN", bounds::SIGN);
@@ -465,6 +515,8 @@ fn prelude(features: &Features) -> String {
         .iter()
         .enumerate()
         .for_each(|(i, name)| p.b(&format!("HAS_{name}"), features.codecs >> i & 1 == 1));
+    let plain = codec_bit(Codec::F32) | codec_bit(Codec::F16) | codec_bit(Codec::Uniform { bits: 3 });
+    p.b("HAS_OTHER_CODECS", features.codecs & !plain != 0);
     p.u("BC7_MODES", tables::BC7_MODES);
     p.u("BC7_WEIGHTS", tables::BC7_WEIGHTS);
     p.u("BC7_TWO_SUBSETS", tables::BC7_TWO_SUBSETS);
@@ -514,8 +566,17 @@ fn prelude(features: &Features) -> String {
     p.b("HAS_EMISSION", features.glow_channel.is_some());
     p.b("IS_GREY", features.is_grey);
     p.b("ENCODES_SRGB", features.encodes_srgb);
-    for (i, name) in
-        ["VIEW_DENSITY", "VIEW_DEPTH", "VIEW_INDEX", "VIEW_FIRST_DENSITY", "VIEW_HITS"].iter().enumerate()
+    for (i, name) in [
+        "VIEW_DENSITY",
+        "VIEW_DEPTH",
+        "VIEW_INDEX",
+        "VIEW_FIRST_DENSITY",
+        "VIEW_HITS",
+        "VIEW_NEAREST",
+        "VIEW_TRILINEAR",
+    ]
+    .iter()
+    .enumerate()
     {
         p.u(name, i);
     }
@@ -556,11 +617,12 @@ mod tests {
             name: "count",
             state: "vec2<u32>",
             layer: Layer::Brick,
+            enter: "",
             step: "(*state).x += 1u;",
             empty: "(*state).y += 1u;",
         };
         let all = Features::ALL;
-        validate(&(Source::Views.text(&all) + &hdda(&body)));
+        validate(&(Source::Views.text(&all) + &hdda(&all, &body)));
     }
 
     #[test]

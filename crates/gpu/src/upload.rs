@@ -30,6 +30,8 @@ pub struct Volume {
 struct Summary {
     origin: DVec3,
     codecs: u32,
+    has_maps: bool,
+    are_densities: bool,
     frames: usize,
     channels: usize,
     /// Of each channel.
@@ -41,7 +43,7 @@ struct Summary {
 /// The memory that a volume takes on its device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SizeBytes {
-    /// Nodes, masks and entries.
+    /// Nodes, masks, entries and maps of bricks.
     pub trees: u64,
     /// Bricks and shapes.
     pub bricks: u64,
@@ -108,6 +110,8 @@ impl Volume {
             arrays: Summary {
                 origin: arrays.origin(),
                 codecs: arrays.codecs(),
+                has_maps: arrays.has_maps(),
+                are_densities: arrays.are_densities(),
                 frames: arrays.frames(),
                 channels: arrays.channels(),
                 largest: (0..arrays.channels()).map(|channel| arrays.largest(channel)).collect(),
@@ -153,6 +157,16 @@ impl Volume {
 
     pub(crate) fn codecs(&self) -> u32 {
         self.arrays.codecs
+    }
+
+    /// Whether all values mean themselves.
+    pub(crate) fn are_densities(&self) -> bool {
+        self.arrays.are_densities
+    }
+
+    /// Whether bricks are looked up in maps.
+    pub(crate) fn has_maps(&self) -> bool {
+        self.arrays.has_maps
     }
 
     /// How many buffers hold bricks, and log2 of the words of each.

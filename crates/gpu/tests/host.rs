@@ -231,7 +231,10 @@ fn what_makes_no_sense_is_an_error() {
     let prepared = renderer.prepare(&volume, &look, &Pass::March(Quality::default()), 0, None);
     assert!(matches!(prepared, Err(GpuError::Unsupported { .. })), "{prepared:?}");
     assert!(matches!(renderer.run(&volume), Err(GpuError::Misuse(_))), "nothing was prepared");
-    assert!(matches!(renderer.prepare(&volume, &look, &Pass::Hits, 1, None), Err(GpuError::Misuse(_))));
+    assert!(matches!(
+        renderer.prepare(&volume, &look, &Pass::Hits { above: 0.0 }, 1, None),
+        Err(GpuError::Misuse(_))
+    ));
 }
 
 /// Pointers out of range are refused before anything of the asset reaches a device; pages that are absent when they are
