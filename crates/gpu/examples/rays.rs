@@ -16,7 +16,7 @@ use std::time::Instant;
 use glam::{DAffine3, DVec3, IVec3};
 use nuage_gpu::arrays::{Arrays, Bricks, Meaning, Wanted};
 use nuage_gpu::device::Gpu;
-use nuage_gpu::look::{Look, Pass};
+use nuage_gpu::look::{Look, Medium, MediumPlace, Pass};
 use nuage_gpu::renderer::Renderer;
 use nuage_gpu::upload::Volume;
 use nuage_pipeline::import::{import, import_surface};
@@ -280,15 +280,16 @@ fn main() -> Result<(), Failure> {
     let world = |p: DVec3| ours.world_from_index.transform_point3(p - shift);
     let camera = Camera::look_at(world(eye), world(target), DVec3::Y, 45.0).ok_or("no view")?;
     let voxel_size = ours.world_from_index.matrix3.x_axis.length();
-    let look = Look {
-        camera,
+    let medium = Medium {
+        place: MediumPlace::Channel(0),
+        coarse: None,
         extinction: [(EXTINCTION_PER_VOXEL / voxel_size) as f32; 3],
         albedo: [0.0; 3],
         phase: Phase::HenyeyGreenstein { g: 0.0 },
         glow: None,
-        lights: Vec::new(),
-        sky: Sky::Constant([0.0; 3]),
     };
+    let sky = Sky::Constant([0.0; 3]);
+    let look = Look { camera, media: vec![medium], lights: Vec::new(), sky };
     let pass = match kernel.as_str() {
         "surface" => Pass::Hits { above: ours.level },
         "nearest" => Pass::Opacity { filter: Filter::Nearest, step_voxels: STEP_VOXELS },
