@@ -22,7 +22,7 @@ use crate::upload::Volume;
 const COUNT: u32 = 4096;
 
 /// A device, or `None` after saying that there is none.
-fn gpu() -> Option<Gpu> {
+pub(crate) fn gpu() -> Option<Gpu> {
     match Gpu::open(&Wanted::Best) {
         Ok(gpu) => Some(gpu),
         Err(error) => {
