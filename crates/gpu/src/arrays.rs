@@ -20,6 +20,7 @@ use nuage_volume::packed::build::{EntryScale, Packer};
 use nuage_volume::packed::{Content, Entry, Node, RootCell, TreeRef, Trees, mask};
 use nuage_volume::space::{BRICK_VOXELS, NODE4_SLOTS, NODE5_SLOTS};
 
+use crate::blocks;
 use crate::error::GpuError;
 use crate::params::{Field, Place};
 use crate::shader::{HEADER_WORDS, codec_bit};
@@ -29,6 +30,9 @@ use crate::shader::{HEADER_WORDS, codec_bit};
 pub enum Bricks {
     /// As they are stored: the least memory.
     AsStored,
+    /// As they are stored, but for those of texture blocks, which stand in 3D textures that the device decodes as it reads
+    /// them: as little memory, and less work. [`crate::device::Gpu::smallest_bricks`] says whether a device does.
+    Textures,
     /// As floats, 2 KiB each: the least work for each sample, and the same values.
     Decoded,
 }
@@ -76,6 +80,9 @@ pub struct Arrays {
     trees: Trees,
     words: Vec<u32>,
     shapes: Vec<u32>,
+    /// What goes to textures, by [`blocks::FORMATS`], where bricks of blocks have a number in place of them.
+    blocks: [Vec<u32>; 3],
+    has_textures: bool,
     /// Frame by frame, as many as there are channels; those that are nowhere are `None`.
     places: Vec<Option<Place>>,
     largest: Vec<f32>,
@@ -166,10 +173,9 @@ impl Arrays {
             })?;
         let mut arrays =
             Arrays { channels: wanted.len(), largest: vec![0.0; wanted.len()], ..Arrays::default() };
-        if form == Bricks::AsStored {
-            arrays.shapes = asset.store().shape_words().to_vec();
-            arrays.codecs =
-                asset.store().shape_codecs().iter().fold(0, |bits, codec| bits | codec_bit(*codec));
+        arrays.has_textures = form == Bricks::Textures;
+        if form != Bricks::Decoded {
+            arrays.take_shapes(asset);
         }
         let mut gathered = Gathered::default();
         for frame in frames {
@@ -209,6 +215,50 @@ impl Arrays {
         };
         let (places, largest) = (vec![Some(place)], vec![unit]);
         Arrays { words, shapes, places, largest, channels: 1, codecs: u32::MAX, ..Arrays::default() }
+    }
+
+    /// Takes all shapes. Each stays where it is, so that bricks find it; what goes to textures leaves a gap.
+    fn take_shapes(&mut self, asset: &Asset) {
+        let store = asset.store();
+        self.shapes = store.shape_words().to_vec();
+        let mut at = 0;
+        for codec in store.shape_codecs() {
+            let end = at + codec.word_count();
+            if let Some(words) = store.shape_words().get(at..end) {
+                let taken = self.taken(*codec, words);
+                self.shapes[at..at + taken.len()].copy_from_slice(&taken);
+            }
+            self.codecs |= codec_bit(*codec);
+            at = end;
+        }
+    }
+
+    /// The words of a brick as they stand among others: of blocks that go to a texture, the line and their number there.
+    fn taken(&mut self, codec: Codec, words: &[u32]) -> Vec<u32> {
+        match (codec, words) {
+            (Codec::Block { format, .. }, [line, of_blocks @ ..]) if self.has_textures => {
+                let blocks = &mut self.blocks[blocks::number_of(format)];
+                let number = blocks.len() / blocks::brick_words(format);
+                blocks.extend_from_slice(of_blocks);
+                vec![*line, number as u32]
+            }
+            _ => words.to_vec(),
+        }
+    }
+
+    /// Moves bricks and shapes at these offsets to textures, for tests of their decoders.
+    #[cfg(test)]
+    pub(crate) fn move_to_textures(&mut self, bricks: &[(Codec, u32)], shapes: &[(Codec, u32)]) {
+        self.has_textures = true;
+        let (mut words, mut shape_words) = (self.words.clone(), self.shapes.clone());
+        for (all, places) in [(&mut words, bricks), (&mut shape_words, shapes)] {
+            for (codec, at) in places {
+                let words = &mut all[*at as usize..][..codec.word_count()];
+                let taken = self.taken(*codec, words);
+                words[..taken.len()].copy_from_slice(&taken);
+            }
+        }
+        (self.words, self.shapes) = (words, shape_words);
     }
 
     /// Takes the finest tree of a grid.
@@ -291,7 +341,7 @@ impl Arrays {
         let Some(Content::Brick { codec, offset }) = entry.content() else { return Ok(entry) };
         // Words mean the same in all channels, values do not.
         let (key, kept) = match form {
-            Bricks::AsStored => ((0, offset), codec),
+            Bricks::AsStored | Bricks::Textures => ((0, offset), codec),
             Bricks::Decoded => ((channel, offset), Codec::F32),
         };
         let payload = match gathered.bricks.get(&key) {
@@ -304,7 +354,10 @@ impl Arrays {
                 asset.decode(channel, codec, offset, &mut values)?;
                 match form {
                     Bricks::Decoded => self.words.extend(values.iter().map(|value| value.to_bits())),
-                    Bricks::AsStored => self.words.extend_from_slice(stored_words(asset, codec, offset)?),
+                    Bricks::AsStored | Bricks::Textures => {
+                        let words = self.taken(codec, stored_words(asset, codec, offset)?);
+                        self.words.extend(words);
+                    }
                 }
                 self.codecs |= codec_bit(kept);
                 gathered.bricks.insert(key, at);
@@ -361,7 +414,13 @@ impl Arrays {
 
     /// The bytes of trees, and of bricks and shapes.
     pub fn size_bytes(&self) -> [usize; 2] {
-        [self.trees.size_bytes(), size_of::<u32>() * (self.words.len() + self.shapes.len())]
+        let of_blocks: usize = self.blocks.iter().map(Vec::len).sum();
+        [self.trees.size_bytes(), size_of::<u32>() * (self.words.len() + self.shapes.len() + of_blocks)]
+    }
+
+    /// The words of what goes to textures, by [`blocks::FORMATS`]; `None` if nothing does.
+    pub(crate) fn blocks(&self) -> Option<&[Vec<u32>; 3]> {
+        self.has_textures.then_some(&self.blocks)
     }
 
     pub(crate) fn codecs(&self) -> u32 {

@@ -3,8 +3,10 @@
 //! What does not live here: buffers of volumes ([`crate::upload`]) and pipelines ([`crate::renderer`]).
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
+use crate::arrays::Bricks;
+use crate::blocks;
 use crate::error::GpuError;
 
 /// Which device to use.
@@ -23,6 +25,8 @@ pub struct Gpu {
     queue: wgpu::Queue,
     name: String,
     fault: Arc<Mutex<Option<GpuError>>>,
+    /// Whether textures of blocks are read right, once that was tried.
+    reads_blocks: Arc<OnceLock<bool>>,
 }
 
 /// The names of all devices, the best first.
@@ -75,7 +79,7 @@ impl Gpu {
         };
         let descriptor = wgpu::DeviceDescriptor {
             label: Some("nuage"),
-            required_features: adapter.features() & wgpu::Features::TIMESTAMP_QUERY,
+            required_features: adapter.features() & (wgpu::Features::TIMESTAMP_QUERY | blocks::NEEDED),
             required_limits,
             ..Default::default()
         };
@@ -92,7 +96,7 @@ impl Gpu {
 
     /// A device that somebody else opened and goes on using. Its handlers of faults stay as they are.
     pub fn from_host(device: wgpu::Device, queue: wgpu::Queue, name: String) -> Gpu {
-        Gpu { device, queue, name, fault: Arc::default() }
+        Gpu { device, queue, name, fault: Arc::default(), reads_blocks: Arc::default() }
     }
 
     /// The name of the device.
@@ -108,6 +112,22 @@ impl Gpu {
     /// Its queue.
     pub fn queue(&self) -> &wgpu::Queue {
         &self.queue
+    }
+
+    /// How bricks take the least memory on this device: [`Bricks::Textures`] if it reads such textures right, which is tried
+    /// once, else [`Bricks::AsStored`].
+    ///
+    /// # Errors
+    /// If the device fails.
+    pub fn smallest_bricks(&self) -> Result<Bricks, GpuError> {
+        let reads = match self.reads_blocks.get() {
+            Some(known) => *known,
+            None => {
+                let found = blocks::are_read(self)?;
+                *self.reads_blocks.get_or_init(|| found)
+            }
+        };
+        Ok(if reads { Bricks::Textures } else { Bricks::AsStored })
     }
 
     /// Does something with the device, whose complaints become errors.

@@ -12,6 +12,7 @@
 #![forbid(unsafe_code)]
 
 pub mod arrays;
+mod blocks;
 pub mod device;
 pub mod error;
 pub mod look;

@@ -1,18 +1,22 @@
 //! A volume on a device: the buffers of its trees and bricks, and what binds them.
 //!
-//! Trees stand in one buffer, fields in another, bricks in as many as the device's limit of a binding asks for.
+//! Trees stand in one buffer, fields in another, bricks in as many as the device's limit of a binding asks for, and those of
+//! texture blocks in a texture for each format, where that is asked for.
 //! All frames are there at once: which one is shown is a number that passes are told.
 
 use glam::DVec3;
 
 use crate::arrays::Arrays;
+use crate::blocks::{self, Blocks, FORMATS};
 use crate::device::Gpu;
 use crate::error::GpuError;
 use crate::params::Place;
 use crate::shader::tables;
 
 /// The most buffers of bricks: with what else a pass reads, as many storage buffers as WebGPU promises.
-const MAX_CHUNKS: u64 = 4;
+pub(crate) const MAX_CHUNKS: u64 = 4;
+/// The binding of the texture of the first format of blocks.
+pub(crate) const FIRST_TEXTURE: u32 = 3 + MAX_CHUNKS as u32;
 
 /// A volume on a device.
 #[derive(Debug)]
@@ -22,6 +26,7 @@ pub struct Volume {
     arrays: Summary,
     chunks: u32,
     log2_chunk_words: u32,
+    textures: u32,
     size_bytes: SizeBytes,
 }
 
@@ -45,6 +50,8 @@ pub struct SizeBytes {
     pub trees: u64,
     /// Bricks and shapes.
     pub bricks: u64,
+    /// Bricks in textures, with what no brick fills.
+    pub textures: u64,
     /// Fields and tables.
     pub tables: u64,
 }
@@ -96,12 +103,29 @@ impl Volume {
             buffers.push(buffer);
         }
 
+        let mut textures = Vec::new();
+        for (binding, (format, words)) in
+            (FIRST_TEXTURE..).zip(FORMATS.iter().zip(arrays.blocks().into_iter().flatten()))
+        {
+            if words.is_empty() {
+                continue;
+            }
+            if !gpu.device().features().contains(blocks::NEEDED) {
+                return Err(GpuError::Misuse("textures of blocks on a device that has none".to_owned()));
+            }
+            let texture = Blocks::new(gpu, *format, words.len() / blocks::brick_words(*format))?;
+            texture.write(gpu, words)?;
+            textures.push((binding, texture));
+        }
+
         let all: Vec<&wgpu::Buffer> = [&tree, &fields_buffer, &tables].into_iter().chain(&buffers).collect();
         let entry = |binding: usize| storage_entry(binding as u32, true, wgpu::ShaderStages::COMPUTE);
-        let entries: Vec<_> = (0..all.len()).map(entry).collect();
+        let of_textures = textures.iter().map(|(binding, _)| texture_entry(*binding));
+        let entries: Vec<_> = (0..all.len()).map(entry).chain(of_textures).collect();
         let descriptor = wgpu::BindGroupLayoutDescriptor { label: Some("nuage volume"), entries: &entries };
         let layout = gpu.guarded(|| gpu.device().create_bind_group_layout(&descriptor))?;
-        let bind_group = bind(gpu, "nuage volume", &layout, &all)?;
+        let views: Vec<_> = textures.iter().map(|(binding, texture)| (*binding, texture.view())).collect();
+        let bind_group = bind_all(gpu, "nuage volume", &layout, &all, &views)?;
         Ok(Volume {
             layout,
             bind_group,
@@ -115,9 +139,11 @@ impl Volume {
             },
             chunks: chunks as u32,
             log2_chunk_words,
+            textures: textures.iter().fold(0, |bits, (binding, _)| bits | 1 << (binding - FIRST_TEXTURE)),
             size_bytes: SizeBytes {
                 trees: tree.size(),
                 bricks: buffers.iter().map(wgpu::Buffer::size).sum(),
+                textures: textures.iter().map(|(_, texture)| texture.size_bytes()).sum(),
                 tables: fields_buffer.size() + 4 * table_words.len() as u64,
             },
         })
@@ -160,6 +186,11 @@ impl Volume {
         (self.chunks, self.log2_chunk_words)
     }
 
+    /// The formats of which there are textures, a bit each.
+    pub(crate) fn textures(&self) -> u32 {
+        self.textures
+    }
+
     /// The largest value of a channel in all frames.
     pub(crate) fn largest(&self, channel: usize) -> f32 {
         self.arrays.largest.get(channel).copied().unwrap_or(0.0)
@@ -178,6 +209,16 @@ pub(crate) fn storage_entry(
     visibility: wgpu::ShaderStages,
 ) -> wgpu::BindGroupLayoutEntry {
     buffer_entry(binding, visibility, wgpu::BufferBindingType::Storage { read_only })
+}
+
+/// A binding of a texture of blocks.
+pub(crate) fn texture_entry(binding: u32) -> wgpu::BindGroupLayoutEntry {
+    let ty = wgpu::BindingType::Texture {
+        sample_type: wgpu::TextureSampleType::Float { filterable: false },
+        view_dimension: wgpu::TextureViewDimension::D3,
+        multisampled: false,
+    };
+    wgpu::BindGroupLayoutEntry { binding, visibility: wgpu::ShaderStages::COMPUTE, ty, count: None }
 }
 
 /// A binding of a buffer.
@@ -200,9 +241,24 @@ pub(crate) fn bind(
     layout: &wgpu::BindGroupLayout,
     buffers: &[&wgpu::Buffer],
 ) -> Result<wgpu::BindGroup, GpuError> {
-    let resources = buffers.iter().map(|buffer| buffer.as_entire_binding());
-    let entries: Vec<_> =
-        (0..).zip(resources).map(|(binding, resource)| wgpu::BindGroupEntry { binding, resource }).collect();
+    bind_all(gpu, label, layout, buffers, &[])
+}
+
+/// As [`bind`], with textures at bindings of their own.
+fn bind_all(
+    gpu: &Gpu,
+    label: &str,
+    layout: &wgpu::BindGroupLayout,
+    buffers: &[&wgpu::Buffer],
+    textures: &[(u32, wgpu::TextureView)],
+) -> Result<wgpu::BindGroup, GpuError> {
+    let buffers = (0..).zip(buffers.iter().map(|buffer| buffer.as_entire_binding()));
+    let textures =
+        textures.iter().map(|(binding, view)| (*binding, wgpu::BindingResource::TextureView(view)));
+    let entries: Vec<_> = buffers
+        .chain(textures)
+        .map(|(binding, resource)| wgpu::BindGroupEntry { binding, resource })
+        .collect();
     let descriptor = wgpu::BindGroupDescriptor { label: Some(label), layout, entries: &entries };
     gpu.guarded(|| gpu.device().create_bind_group(&descriptor))
 }

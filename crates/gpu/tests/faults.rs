@@ -3,7 +3,7 @@
 
 mod common;
 
-use common::{SIZE, cloud, gpu, lit};
+use common::{SIZE, cloud, gpu, host, lit};
 use nuage_gpu::arrays::Arrays;
 use nuage_gpu::device::Gpu;
 use nuage_gpu::error::GpuError;
@@ -11,18 +11,6 @@ use nuage_gpu::look::{Look, Pass};
 use nuage_gpu::renderer::Renderer;
 use nuage_gpu::upload::Volume;
 use nuage_render::views::View;
-
-/// A device that a host opened, or `None` if there is none.
-fn host(required_limits: wgpu::Limits) -> Option<Gpu> {
-    let name = gpu()?.name().to_owned();
-    let instance = wgpu::Instance::new(wgpu::InstanceDescriptor::new_without_display_handle());
-    let adapters = pollster::block_on(instance.enumerate_adapters(wgpu::Backends::PRIMARY));
-    let adapter =
-        adapters.into_iter().find(|adapter| adapter.get_info().name == name).expect("the same device");
-    let descriptor = wgpu::DeviceDescriptor { required_limits, ..Default::default() };
-    let (device, queue) = pollster::block_on(adapter.request_device(&descriptor)).expect("a device");
-    Some(Gpu::from_host(device, queue, name))
-}
 
 #[test]
 fn a_lost_device_is_an_error() {
