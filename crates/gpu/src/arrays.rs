@@ -283,7 +283,10 @@ impl Arrays {
             let entry = self.node(asset, channel, cell.entry, Kind::Node5, form, gathered)?;
             self.trees.cells.push(RootCell { entry, ..*cell });
         }
-        Ok(Some(place_of(info, tree, world_from_source, offset, [min, max], first_cell, meaning)))
+        // No sum of what a file says may overflow.
+        let inside = |p: [i32; 3]| IVec3::from_array(p).checked_sub(offset).ok_or_else(damaged);
+        let active_box = IndexBox { min: inside(min)?, max: inside(max)? };
+        Ok(Some(place_of(info, tree, world_from_source, offset, active_box, first_cell, meaning)))
     }
 
     /// An entry of a root or of a `Node5`, which leads to a node of the given kind, with all below it.
@@ -486,13 +489,13 @@ fn place_of(
     tree: &TreeRef,
     world_from_source: DAffine3,
     offset: IVec3,
-    [min, max]: [[i32; 3]; 2],
+    active_box: IndexBox,
     first_cell: u32,
     meaning: Meaning,
 ) -> Place {
     Place {
         world_from_index: world_from_source * DAffine3::from_translation(offset.as_dvec3()),
-        active_box: IndexBox { min: IVec3::from_array(min) - offset, max: IVec3::from_array(max) - offset },
+        active_box,
         index_offset: offset,
         cells: [first_cell, tree.cell_count],
         brick_unit: info.unit,

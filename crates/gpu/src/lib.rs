@@ -24,4 +24,6 @@ mod sky;
 pub mod upload;
 
 #[cfg(test)]
+mod hostile;
+#[cfg(test)]
 mod twins;

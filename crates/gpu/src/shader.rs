@@ -22,6 +22,10 @@ use crate::upload::FIRST_TEXTURE;
 pub(crate) const WORKGROUP_SIDE: u32 = 8;
 /// The tag of an entry that is not there.
 const ABSENT_TAG: u32 = 254;
+/// The most random numbers of one path, and leaps of one ray over regions of many bricks: paths and volumes that ask for more
+/// would keep a device busy until its driver takes it for lost.
+const MAX_DRAWS: u32 = 1 << 20;
+const MAX_LEAPS: u32 = 1 << 16;
 /// The words in front of the arrays of trees that say where each begins.
 pub(crate) const HEADER_WORDS: usize = 8;
 
@@ -513,6 +517,8 @@ fn prelude(features: &Features) -> String {
     p.u("BC7_THREE_SECOND_ANCHOR", tables::BC7_THREE_SECOND_ANCHOR);
     p.u("BC7_THREE_THIRD_ANCHOR", tables::BC7_THREE_THIRD_ANCHOR);
 
+    p.u("MAX_DRAWS", MAX_DRAWS);
+    p.u("MAX_LEAPS", MAX_LEAPS);
     p.u("MAX_ROOT_LEAPS", traverse::MAX_ROOT_LEAPS);
     p.i("MAX_ROOT_LEAP", traverse::MAX_ROOT_LEAP as i32);
     p.u("MOST_REFINEMENTS", surface::MOST_REFINEMENTS);

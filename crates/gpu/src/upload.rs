@@ -23,8 +23,9 @@ pub(crate) const FIRST_TEXTURE: u32 = 3 + MAX_CHUNKS as u32;
 pub struct Volume {
     layout: wgpu::BindGroupLayout,
     bind_group: wgpu::BindGroup,
+    tree: wgpu::Buffer,
+    bricks: Vec<wgpu::Buffer>,
     arrays: Summary,
-    chunks: u32,
     log2_chunk_words: u32,
     textures: u32,
     size_bytes: SizeBytes,
@@ -137,7 +138,6 @@ impl Volume {
                 largest: (0..arrays.channels()).map(|channel| arrays.largest(channel)).collect(),
                 places: arrays.places().to_vec(),
             },
-            chunks: chunks as u32,
             log2_chunk_words,
             textures: textures.iter().fold(0, |bits, (binding, _)| bits | 1 << (binding - FIRST_TEXTURE)),
             size_bytes: SizeBytes {
@@ -146,6 +146,8 @@ impl Volume {
                 textures: textures.iter().map(|(_, texture)| texture.size_bytes()).sum(),
                 tables: fields_buffer.size() + 4 * table_words.len() as u64,
             },
+            tree,
+            bricks: buffers,
         })
     }
 
@@ -183,7 +185,13 @@ impl Volume {
 
     /// How many buffers hold bricks, and log2 of the words of each.
     pub(crate) fn chunks(&self) -> (u32, u32) {
-        (self.chunks, self.log2_chunk_words)
+        (self.bricks.len() as u32, self.log2_chunk_words)
+    }
+
+    /// The buffers of the tree and of bricks, for tests of what happens if they hold anything.
+    #[cfg(test)]
+    pub(crate) fn buffers(&self) -> impl Iterator<Item = &wgpu::Buffer> {
+        std::iter::once(&self.tree).chain(&self.bricks)
     }
 
     /// The formats of which there are textures, a bit each.
