@@ -14,6 +14,7 @@ use glam::{DAffine3, DVec3, IVec3};
 use nuage_volume::brick;
 use nuage_volume::channel::{Channel, IndexBox};
 use nuage_volume::codec::Codec;
+use nuage_volume::codec::block::BlockFormat;
 use nuage_volume::format::Asset;
 use nuage_volume::format::contents::{ChannelInfo, FrameGrid};
 use nuage_volume::packed::build::{EntryScale, Packer};
@@ -83,12 +84,37 @@ pub struct Arrays {
     /// What goes to textures, by [`blocks::FORMATS`], where bricks of blocks have a number in place of them.
     blocks: [Vec<u32>; 3],
     has_textures: bool,
+    /// Whether only room is asked for: then the words of bricks are zeros, and their pages need not be loaded.
+    is_room: bool,
     /// Frame by frame, as many as there are channels; those that are nowhere are `None`.
     places: Vec<Option<Place>>,
     largest: Vec<f32>,
     channels: usize,
     codecs: u32,
     origin: DVec3,
+}
+
+/// How much a volume has to hold.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(crate) struct Room {
+    pub(crate) tree_words: usize,
+    pub(crate) fields: usize,
+    /// With those of shapes.
+    pub(crate) brick_words: usize,
+    /// Bricks in textures, by [`blocks::FORMATS`].
+    pub(crate) blocks: [usize; 3],
+}
+
+impl Room {
+    /// Room for either.
+    pub(crate) fn max(self, other: Room) -> Room {
+        Room {
+            tree_words: self.tree_words.max(other.tree_words),
+            fields: self.fields.max(other.fields),
+            brick_words: self.brick_words.max(other.brick_words),
+            blocks: std::array::from_fn(|i| self.blocks[i].max(other.blocks[i])),
+        }
+    }
 }
 
 /// Of which kind a node is.
@@ -165,14 +191,33 @@ impl Arrays {
         frames: Range<usize>,
         form: Bricks,
     ) -> Result<Arrays, GpuError> {
+        Arrays::default().with(asset, wanted, frames, form)
+    }
+
+    /// As [`Arrays::of_asset`], with zeros in place of the words of bricks, whose pages need not be loaded.
+    pub(crate) fn room_of(
+        asset: &Asset,
+        wanted: &[Wanted],
+        frame: usize,
+        form: Bricks,
+    ) -> Result<Arrays, GpuError> {
+        Arrays { is_room: true, ..Arrays::default() }.with(asset, wanted, frame..frame + 1, form)
+    }
+
+    fn with(
+        self,
+        asset: &Asset,
+        wanted: &[Wanted],
+        frames: Range<usize>,
+        form: Bricks,
+    ) -> Result<Arrays, GpuError> {
         let contents = asset.contents();
         let frames =
             contents.frames.get(frames.clone()).filter(|frames| !frames.is_empty()).ok_or_else(|| {
                 let count = contents.frames.len();
                 GpuError::Misuse(format!("frames {} to {} of {count}", frames.start, frames.end))
             })?;
-        let mut arrays =
-            Arrays { channels: wanted.len(), largest: vec![0.0; wanted.len()], ..Arrays::default() };
+        let mut arrays = Arrays { channels: wanted.len(), largest: vec![0.0; wanted.len()], ..self };
         arrays.has_textures = form == Bricks::Textures;
         if form != Bricks::Decoded {
             arrays.take_shapes(asset);
@@ -354,11 +399,16 @@ impl Arrays {
                 let at = at - BRICK_VOXELS as u32;
                 // Decoding is also what finds a damaged brick before a shader meets it.
                 let mut values = [0.0; BRICK_VOXELS];
-                asset.decode(channel, codec, offset, &mut values)?;
+                if !self.is_room {
+                    asset.decode(channel, codec, offset, &mut values)?;
+                }
                 match form {
                     Bricks::Decoded => self.words.extend(values.iter().map(|value| value.to_bits())),
                     Bricks::AsStored | Bricks::Textures => {
-                        let words = self.taken(codec, stored_words(asset, codec, offset)?);
+                        let words = match self.is_room {
+                            true => self.taken(codec, &vec![0; codec.word_count()]),
+                            false => self.taken(codec, stored_words(asset, codec, offset)?),
+                        };
                         self.words.extend(words);
                     }
                 }
@@ -404,6 +454,24 @@ impl Arrays {
         self.origin = if middle.is_finite() { middle } else { DVec3::ZERO };
     }
 
+    /// Takes other frames for what is to be the same for all: their origin, their codecs, and their largest values.
+    pub(crate) fn agree_with(&mut self, other: &Arrays) {
+        self.origin = other.origin;
+        self.codecs |= other.codecs;
+        for (largest, other) in self.largest.iter_mut().zip(&other.largest) {
+            *largest = largest.max(*other);
+        }
+    }
+
+    /// Keeps of further frames where they are and what [`Arrays::agree_with`] takes of them, and not their words.
+    pub(crate) fn append_places(&mut self, other: &Arrays) {
+        self.places.extend(&other.places);
+        self.channels = other.channels;
+        self.largest.resize(other.largest.len(), 0.0);
+        self.agree_with(other);
+        self.settle();
+    }
+
     /// How many channels each frame has.
     pub fn channels(&self) -> usize {
         self.channels
@@ -442,6 +510,18 @@ impl Arrays {
     /// The largest value of a channel in all frames.
     pub(crate) fn largest(&self, channel: usize) -> f32 {
         self.largest.get(channel).copied().unwrap_or(0.0)
+    }
+
+    /// The room that all this takes.
+    pub(crate) fn room(&self) -> Room {
+        let bricks = |(format, words): (&BlockFormat, &Vec<u32>)| words.len() / blocks::brick_words(*format);
+        let mut of_formats = blocks::FORMATS.iter().zip(&self.blocks).map(bricks);
+        Room {
+            tree_words: HEADER_WORDS + self.trees.size_bytes() / size_of::<u32>(),
+            fields: self.places.len().max(1),
+            brick_words: self.words.len() + self.shapes.len(),
+            blocks: std::array::from_fn(|_| of_formats.next().unwrap_or(0)),
+        }
     }
 
     /// All fields, frame by frame. One at least, since no buffer is empty.

@@ -49,17 +49,8 @@ impl Blocks {
     /// # Errors
     /// If they are more than the device takes, or it fails.
     pub(crate) fn new(gpu: &Gpu, format: BlockFormat, bricks: usize) -> Result<Blocks, GpuError> {
-        let bricks = bricks.max(1);
-        let limit = gpu.device().limits().max_texture_dimension_3d;
-        let (most_layers, most_log2) = (limit as usize / format.slices(), limit.ilog2() - LOG2_BRICK);
-        let fits = |log2_side: &u32| bricks.div_ceil(1 << (2 * log2_side)) <= most_layers;
-        let log2_side = (0..=most_log2).find(fits).ok_or_else(|| GpuError::Limit {
-            what: "a texture of bricks",
-            size_bytes: (bricks * format.brick_bytes()) as u64,
-            limit_bytes: ((most_layers << (2 * most_log2)) * format.brick_bytes()) as u64,
-        })?;
+        let (log2_side, layers) = Blocks::layout(gpu, format, bricks)?;
         let side = 1 << (log2_side + LOG2_BRICK);
-        let layers = bricks.div_ceil(1 << (2 * log2_side));
         let descriptor = wgpu::TextureDescriptor {
             label: Some("nuage blocks"),
             size: wgpu::Extent3d {
@@ -80,6 +71,29 @@ impl Blocks {
         };
         let texture = gpu.guarded(|| gpu.device().create_texture(&descriptor))?;
         Ok(Blocks { format, texture, log2_side })
+    }
+
+    /// log2 of the bricks along the sides of a layer, and how many layers there are.
+    fn layout(gpu: &Gpu, format: BlockFormat, bricks: usize) -> Result<(u32, usize), GpuError> {
+        let bricks = bricks.max(1);
+        let limit = gpu.device().limits().max_texture_dimension_3d;
+        let (most_layers, most_log2) = (limit as usize / format.slices(), limit.ilog2() - LOG2_BRICK);
+        let fits = |log2_side: &u32| bricks.div_ceil(1 << (2 * log2_side)) <= most_layers;
+        let log2_side = (0..=most_log2).find(fits).ok_or_else(|| GpuError::Limit {
+            what: "a texture of bricks",
+            size_bytes: (bricks * format.brick_bytes()) as u64,
+            limit_bytes: ((most_layers << (2 * most_log2)) * format.brick_bytes()) as u64,
+        })?;
+        Ok((log2_side, bricks.div_ceil(1 << (2 * log2_side))))
+    }
+
+    /// The memory of a texture of so many bricks.
+    ///
+    /// # Errors
+    /// If they are more than the device takes.
+    pub(crate) fn size_bytes(gpu: &Gpu, format: BlockFormat, bricks: usize) -> Result<u64, GpuError> {
+        let (log2_side, layers) = Blocks::layout(gpu, format, bricks)?;
+        Ok(((layers << (2 * log2_side)) * format.brick_bytes()) as u64)
     }
 
     /// Copies bricks to the texture, from the first one on: the words of one after the other.
@@ -125,12 +139,6 @@ impl Blocks {
     /// All of it, to be bound.
     pub(crate) fn view(&self) -> wgpu::TextureView {
         self.texture.create_view(&wgpu::TextureViewDescriptor::default())
-    }
-
-    /// The memory of the texture.
-    pub(crate) fn size_bytes(&self) -> u64 {
-        let layers = self.texture.depth_or_array_layers() as usize / self.format.slices();
-        ((layers << (2 * self.log2_side)) * self.format.brick_bytes()) as u64
     }
 }
 

@@ -21,6 +21,7 @@ pub mod picture;
 pub mod renderer;
 mod shader;
 mod sky;
+pub mod stream;
 pub mod upload;
 
 #[cfg(test)]
