@@ -182,6 +182,7 @@ fn bricks_decode_as_in_rust() {
 
 /// Bricks that the device's texture unit decodes: those of BC7 exactly, others as precisely as the formats ask for.
 #[test]
+#[allow(clippy::print_stdout, reason = "the measured errors are worth reading")]
 fn textures_give_the_values_of_blocks() {
     let Some(gpu) = gpu() else { return };
     if gpu.smallest_bricks() != Ok(crate::arrays::Bricks::Textures) {

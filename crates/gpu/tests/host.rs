@@ -237,6 +237,9 @@ fn what_makes_no_sense_is_an_error() {
     assert!(matches!(renderer.prepare(&volume, &look, &Pass::Hits, 1, None), Err(GpuError::Misuse(_))));
 }
 
+/// Moves a pointer by some words, nodes or cells.
+type Damage<'a> = dyn Fn(&mut Contents, &mut Trees, u32) + 'a;
+
 /// The finest tree of the first grid.
 fn level(contents: &mut Contents) -> &mut TreeRef {
     &mut contents.frames[0].grids[0].levels[0]
@@ -255,7 +258,7 @@ fn damaged_volumes_are_refused() {
     let (brick, node4) = (brick.expect("a brick"), node4.expect("a node"));
     assert!(Asset::from_parts(contents, trees, store).is_ok());
     // Each pointer that a shader follows, one beyond the last and far beyond.
-    let damage: [(&str, &dyn Fn(&mut Contents, &mut Trees, u32)); 11] = [
+    let damage: [(&str, &Damage<'_>); 11] = [
         ("the node of a root cell", &|_, trees, by| trees.cells[0].entry.payload += by),
         ("the node of an entry", &|_, trees, by| trees.entries[node4].payload += by),
         ("the mask of a Node5", &|_, trees, by| trees.node5s[0].mask += by),

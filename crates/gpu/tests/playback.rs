@@ -18,7 +18,7 @@ use nuage_render::views::View;
 use nuage_vdb::AnyTree;
 use nuage_volume::format::Asset;
 
-const FRAMES: usize = 6;
+const FRAMES: usize = 4;
 
 /// Frames that fade, the bricks of which are of several codecs.
 fn asset() -> Asset {
@@ -103,7 +103,7 @@ fn streams_stay_within_their_budget_and_show_the_same() {
     assert!(sum(before.clone()) - sum(without) <= budget, "{before:?}");
     let mut sent = 0;
     // Forwards with the next one ahead, then here and there.
-    let order = (0..FRAMES).flat_map(|frame| [frame, (frame + 1) % FRAMES]).chain([3, 0, 5, 0, 2]);
+    let order = (0..FRAMES).flat_map(|frame| [frame, (frame + 1) % FRAMES]).chain([3, 1, 0, 2]);
     for (i, frame) in order.enumerate() {
         let was_there = stream.has(frame);
         let volume = stream.frame(&asset, frame).expect("a frame");
