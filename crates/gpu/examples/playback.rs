@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 use glam::{DAffine3, DVec3, Vec3};
 use nuage_gpu::arrays::{Arrays, Meaning, Wanted};
 use nuage_gpu::device::{Gpu, Wanted as Device};
-use nuage_gpu::look::{Look, Pass};
+use nuage_gpu::look::{Look, Medium, MediumPlace, Pass};
 use nuage_gpu::renderer::Renderer;
 use nuage_gpu::stream::Stream;
 use nuage_gpu::upload::Volume;
@@ -91,12 +91,17 @@ fn look(asset: &Asset) -> Option<Look> {
     let centre = world_from_index.transform_point3(0.5 * (min + max));
     let side = world_from_index.transform_vector3(max - min).length();
     let camera = Camera::look_at(centre + DVec3::new(0.6, 0.5, 1.0) * side, centre, DVec3::Z, 40.0)?;
-    Some(Look {
-        camera,
+    let medium = Medium {
+        place: MediumPlace::Channel(0),
+        coarse: None,
         extinction: [(20.0 / side) as f32; 3],
         albedo: [0.9; 3],
         phase: Phase::HenyeyGreenstein { g: 0.3 },
         glow: None,
+    };
+    Some(Look {
+        camera,
+        media: vec![medium],
         lights: vec![Light::Sun(Sun::point(Vec3::new(0.6, 0.0, 0.8), [3.0; 3]))],
         sky: Sky::Constant([0.0; 3]),
     })

@@ -585,11 +585,11 @@ mod tests {
     fn every_entry_point_is_valid() {
         let sources =
             [Source::Views, Source::Surface, Source::March, Source::Path, Source::Tone, Source::Twins];
-use crate::blocks::FORMATS;
         let tricubic = Features { lookup: Lookup::Tricubic, glow_channel: Some(0), ..Features::BARE };
-        let depth = Features { has_depth: true, chunks: 4, ..Features::ALL };
-        for features in [Features::ALL, Features::BARE, tricubic, depth] {
-use crate::upload::FIRST_TEXTURE;
+        validate(&probe());
+        let textures = Features { textures: 7, ..Features::ALL };
+        let depth = Features { has_depth: true, chunks: 4, textures: 4, ..Features::ALL };
+        for features in [Features::ALL, Features::BARE, tricubic, textures, depth] {
             for source in sources {
                 let text = source.text(&features);
                 validate(&text);

@@ -91,7 +91,7 @@ impl Volume {
             trees: bytes(room.tree_words),
             bricks: bytes(room.brick_words.max(1)),
             textures,
-            tables: bytes(tables::WORDS) + (room.fields * size_of::<Field>()) as u64,
+            tables: bytes(tables::words().len()) + (room.fields * size_of::<Field>()) as u64,
         })
     }
 

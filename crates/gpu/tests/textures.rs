@@ -42,7 +42,7 @@ fn arrays_of(asset: &Asset, form: Bricks) -> Arrays {
 fn show(gpu: &Gpu, renderer: &mut Renderer, asset: &Asset, form: Bricks) -> (Vec<[f32; 4]>, SizeBytes) {
     let look = Look::of_scene(&lit(&common::unpacked(asset, 0, "density"))).expect("a look");
     let volume = Volume::new(gpu, &arrays_of(asset, form)).expect("a volume");
-    let pass = Pass::View(View::Density { extinction: look.extinction[0] });
+    let pass = Pass::View(View::Density { extinction: look.media[0].extinction[0] });
     (picture(renderer, &volume, &look, &pass, 0), volume.size_bytes())
 }
 
