@@ -70,6 +70,7 @@ struct Runs {
     sign: vec3<i32>,
     brick_end: vec3<i32>,
     root_leaps_left: u32,
+    leaps_left: u32,
     // What was found and not yet given out: a varying run, one of a value, and a varying one, between these four
     // distances; and how many of them are given out.
     cuts: vec4<f32>,
@@ -107,6 +108,7 @@ fn runs_between(field: u32, ray: LocalRay, t0: f32, t1: f32) -> Runs {
     runs.sign = select(vec3<i32>(-1), vec3<i32>(1), forward);
     runs.brick_end = select(box_first - 1, box_last + 1, forward);
     runs.root_leaps_left = MAX_ROOT_LEAPS;
+    runs.leaps_left = MAX_LEAPS;
     runs.given = 3u;
     aim(&runs);
     return runs;
@@ -151,7 +153,8 @@ fn leap(runs: ptr<function, Runs>, log2_bricks: u32) {
     );
     // The axis of the exit moves by the integers, so that the walk never stands still.
     (*runs).brick = select(within, select(first - 1, last + 1, forward), axis);
-    if (any((*runs).brick < box_first) || any((*runs).brick > box_last)) {
+    (*runs).leaps_left -= 1u;
+    if ((*runs).leaps_left == 0u || any((*runs).brick < box_first) || any((*runs).brick > box_last)) {
         (*runs).t_end = min((*runs).t_end, (*runs).t);
     }
     aim(runs);
