@@ -218,19 +218,18 @@ fn marched_pictures_look_values_up_as_on_the_cpu() {
     let exact = Quality { shadow_step_voxels: 0.0, sun_rays: 6, sky_rays: 0, ..base };
     let few = Quality {
         lookup: Lookup::Tricubic,
-        step_voxels: 2.0,
+        step_voxels: 1.0,
         shadow_step_voxels: 4.0,
-        sun_rays: 4,
         sky_rays: 0,
         ..Quality::default()
     };
     for (name, is_coarse, quality) in [
+        ("tricubic", false, few),
         ("nearest", false, Quality { lookup: Lookup::Nearest, ..base }),
         ("exact shadows", false, exact),
         ("exact shadows of nearest voxels", false, Quality { lookup: Lookup::Nearest, ..exact }),
         ("coarse shadows", true, base),
         ("exact coarse shadows", true, exact),
-        ("tricubic", false, few),
     ] {
         let mut scene = scene.clone();
         scene.volumes[0].coarse = is_coarse.then_some(&coarse);
