@@ -12,6 +12,7 @@
 #![forbid(unsafe_code)]
 
 pub mod arrays;
+mod blocks;
 pub mod device;
 pub mod error;
 pub mod look;
@@ -21,7 +22,10 @@ pub mod picture;
 pub mod renderer;
 mod shader;
 mod sky;
+pub mod stream;
 pub mod upload;
 
+#[cfg(test)]
+mod hostile;
 #[cfg(test)]
 mod twins;

@@ -439,6 +439,7 @@ fn features(
     let has_sky_map = matches!(&look.sky, Sky::Map(map) if !map.is_black());
     Features {
         codecs: volume.codecs(),
+        textures: volume.textures(),
         chunks,
         log2_chunk_words,
         // Where nothing is, there is one medium of nothing.

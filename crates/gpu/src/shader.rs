@@ -14,11 +14,17 @@ use nuage_volume::codec::{self, Codec, bounds, sparse};
 use nuage_volume::packed::{Entry, RootCell};
 use nuage_volume::space::{LOG2_BRICK, LOG2_NODE4_BRICKS, LOG2_NODE5_BRICKS, NODE4_SLOTS, NODE5_SLOTS};
 
+use crate::blocks::FORMATS;
 use crate::maps::{self, ABSENT_TAG};
 use crate::params::{self, MAX_LIGHTS, MAX_MEDIA};
+use crate::upload::FIRST_TEXTURE;
 
 /// Pixels along each side of a workgroup.
 pub(crate) const WORKGROUP_SIDE: u32 = 8;
+/// The most random numbers of one path, and leaps of one ray over regions of many bricks: paths and volumes that ask for more
+/// would keep a device busy until its driver takes it for lost.
+const MAX_DRAWS: u32 = 1 << 20;
+const MAX_LEAPS: u32 = 1 << 16;
 /// The words in front of the arrays of trees that say where each begins.
 pub(crate) const HEADER_WORDS: usize = 8;
 
@@ -27,6 +33,8 @@ pub(crate) const HEADER_WORDS: usize = 8;
 pub(crate) struct Features {
     /// The kinds of codecs that occur, by [`CODEC_KINDS`].
     pub(crate) codecs: u32,
+    /// The formats of blocks that stand in textures, a bit each: then all blocks do.
+    pub(crate) textures: u32,
     /// How many buffers hold the bricks.
     pub(crate) chunks: u32,
     /// log2 of the words of such a buffer.
@@ -63,6 +71,7 @@ impl Features {
     /// What is least of all.
     pub(crate) const BARE: Features = Features {
         codecs: 0,
+        textures: 0,
         chunks: 1,
         log2_chunk_words: 0,
         media: 1,
@@ -84,6 +93,7 @@ impl Features {
     #[cfg(test)]
     pub(crate) const ALL: Features = Features {
         codecs: u32::MAX,
+        textures: 0,
         chunks: 2,
         log2_chunk_words: 25,
         media: 3,
@@ -213,6 +223,7 @@ impl Source {
         }
         text += picture;
         text += &brick_words(features);
+        text += &block_texels(features);
         COMMON.iter().for_each(|part| text += part);
         let end = if features.has_depth { file!("depth_end") } else { file!("open_end") };
         let first_voxel = hdda(
@@ -359,6 +370,38 @@ fn brick_words(features: &Features) -> String {
         text += "    return bricks_0[at];\n}\n";
     }
     text
+}
+
+/// Reads a texel of the texture of a format, and how wide it is.
+fn block_texels(features: &Features) -> String {
+    let there: Vec<usize> =
+        (0..FORMATS.len()).filter(|format| features.textures >> format & 1 == 1).collect();
+    let mut text = String::new();
+    for format in &there {
+        let binding = FIRST_TEXTURE + *format as u32;
+        let _ = writeln!(text, "@group(0) @binding({binding}) var blocks_{format}: texture_3d<f32>;");
+    }
+    let mut function = |head: &str, none: &str, read: &dyn Fn(usize) -> String| {
+        let _ = writeln!(text, "fn {head} {{\n    switch (format) {{");
+        for format in &there {
+            let _ = writeln!(text, "        case {format}u: {{ return {}; }}", read(*format));
+        }
+        let _ = writeln!(text, "        default: {{ return {none}; }}\n    }}\n}}");
+    };
+    function("block_texel(format: u32, at: vec3<u32>) -> vec4<f32>", "vec4<f32>(0.0)", &|format| {
+        format!("textureLoad(blocks_{format}, at, 0)")
+    });
+    function("blocks_width(format: u32) -> u32", "1u << LOG2_BRICK", &|format| {
+        format!("textureDimensions(blocks_{format}).x")
+    });
+    text
+}
+
+/// The shader that reads a texture of blocks to see whether a device does.
+pub(crate) fn probe() -> String {
+    let mut p = Prelude(String::new());
+    p.u("WORKGROUP_SIDE", WORKGROUP_SIDE);
+    p.0 + file!("probe")
 }
 
 /// Where tables stand in the buffer of tables.
@@ -517,6 +560,7 @@ fn prelude(features: &Features) -> String {
         .for_each(|(i, name)| p.b(&format!("HAS_{name}"), features.codecs >> i & 1 == 1));
     let plain = codec_bit(Codec::F32) | codec_bit(Codec::F16) | codec_bit(Codec::Uniform { bits: 3 });
     p.b("HAS_OTHER_CODECS", features.codecs & !plain != 0);
+    p.b("HAS_TEXTURES", features.textures != 0);
     p.u("BC7_MODES", tables::BC7_MODES);
     p.u("BC7_WEIGHTS", tables::BC7_WEIGHTS);
     p.u("BC7_TWO_SUBSETS", tables::BC7_TWO_SUBSETS);
@@ -525,6 +569,8 @@ fn prelude(features: &Features) -> String {
     p.u("BC7_THREE_SECOND_ANCHOR", tables::BC7_THREE_SECOND_ANCHOR);
     p.u("BC7_THREE_THIRD_ANCHOR", tables::BC7_THREE_THIRD_ANCHOR);
 
+    p.u("MAX_DRAWS", MAX_DRAWS);
+    p.u("MAX_LEAPS", MAX_LEAPS);
     p.u("MAX_ROOT_LEAPS", traverse::MAX_ROOT_LEAPS);
     p.i("MAX_ROOT_LEAP", traverse::MAX_ROOT_LEAP as i32);
     p.u("MOST_REFINEMENTS", surface::MOST_REFINEMENTS);
@@ -601,8 +647,10 @@ mod tests {
         let sources =
             [Source::Views, Source::Surface, Source::March, Source::Path, Source::Tone, Source::Twins];
         let tricubic = Features { lookup: Lookup::Tricubic, glow_channel: Some(0), ..Features::BARE };
-        let depth = Features { has_depth: true, chunks: 4, ..Features::ALL };
-        for features in [Features::ALL, Features::BARE, tricubic, depth] {
+        validate(&probe());
+        let textures = Features { textures: 7, ..Features::ALL };
+        let depth = Features { has_depth: true, chunks: 4, textures: 4, ..Features::ALL };
+        for features in [Features::ALL, Features::BARE, tricubic, textures, depth] {
             for source in sources {
                 let text = source.text(&features);
                 validate(&text);

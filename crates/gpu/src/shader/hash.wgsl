@@ -44,6 +44,11 @@ fn three(seed: u32) -> vec3<f32> {
     );
 }
 
+// Whether a path has to end, whatever is to be found: devices are lost that do not come to an end.
+fn has_drawn_enough(random: ptr<function, Random>) -> bool {
+    return (*random).count >= MAX_DRAWS;
+}
+
 // An optical depth at which a ray collides.
 fn random_depth(random: ptr<function, Random>) -> f32 {
     return -ln(1.0 - random_unit(random));

@@ -21,7 +21,7 @@ fn $NAME(field: u32, ray: LocalRay, begin: f32, end: f32, state: ptr<function, $
         let kind = tree[at];
         let is_absent = (kind & 0xffu) == ABSENT_TAG;
         // What is as empty all around.
-        let margin = select(0.0, f32(kind >> 8u) - 1.0, is_absent);
+        let margin = select(0.0, f32(max(kind >> 8u, 1u)) - 1.0, is_absent);
         let faces = select(
             ((local + face + ahead * margin) * BRICK_SIDE - ray.origin) * ray.inverse, vec3<f32>(MAX_F32), is_still,
         );

@@ -133,7 +133,7 @@ fn fly(
             let chance = min(shares_of(nearest_one) * (part / front.live), vec3<f32>(1.0));
             is_real = turns(carried, chance, random);
         }
-        if (is_real) {
+        if (is_real || has_drawn_enough(random)) {
             collision = Collision(next, nearest_one);
             break;
         }

@@ -26,6 +26,11 @@ fn fly(
             var t = segment.t0;
             loop {
                 let left = (segment.t1 - t) * majorant;
+                if (has_drawn_enough(random)) {
+                    // Bounds far above all values: the ray would not get on.
+                    collision = span.x + t;
+                    break;
+                }
                 if (depth >= left) {
                     depth -= left;
                     break;

@@ -61,7 +61,7 @@ fn path_light(first: Ray, limit: f32, seed: u32) -> vec4<f32> {
             break;
         }
         met = 1.0;
-        if (scatterings >= params.counts.y) {
+        if (scatterings >= params.counts.y || has_drawn_enough(&random)) {
             break;
         }
         let phase = params.media[collision.medium].phase;

@@ -107,6 +107,9 @@ fn pass_field(field: u32, medium: u32, ray: Ray, limit: f32, random: ptr<functio
         var t = segment.t0;
         loop {
             let left = (segment.t1 - t) * residual * scale;
+            if (has_drawn_enough(random)) {
+                return vec3<f32>(0.0);
+            }
             if (depth >= left) {
                 depth -= left;
                 break;

@@ -113,7 +113,7 @@ fn mapped_region(field: u32, brick: vec3<i32>) -> Region {
     let kind = tree[at];
     let tag = kind & 0xffu;
     if (tag == ABSENT_TAG) {
-        return Region(0u, i32(kind >> 8u) - 1, Entry(0u, ABSENT_TAG));
+        return Region(0u, max(i32(kind >> 8u), 1) - 1, Entry(0u, ABSENT_TAG));
     }
     let is_node4 = tag == NODE4_TILE_TAG;
     let is_node5 = tag == NODE5_TILE_TAG;

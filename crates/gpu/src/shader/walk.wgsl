@@ -67,6 +67,7 @@ struct Runs {
     box_first: vec3<i32>,
     box_last: vec3<i32>,
     root_leaps_left: u32,
+    leaps_left: u32,
     // What was found and not yet given out: a varying run, one of a value, and a varying one, between these four
     // distances; and how many of them are given out.
     cuts: vec4<f32>,
@@ -94,6 +95,7 @@ fn runs_between(field: u32, ray: LocalRay, t0: f32, t1: f32) -> Runs {
     runs.t = t0;
     runs.t_end = t1;
     runs.root_leaps_left = MAX_ROOT_LEAPS;
+    runs.leaps_left = MAX_LEAPS;
     runs.given = 3u;
     return runs;
 }
@@ -132,6 +134,12 @@ fn pass_region(runs: ptr<function, Runs>, region: Region) {
         return;
     }
     let side = (1 << region.log2_bricks) - 1;
+    if (side > 0) {
+        (*runs).leaps_left -= 1u;
+        if ((*runs).leaps_left == 0u) {
+            (*runs).t_end = min((*runs).t_end, (*runs).t);
+        }
+    }
     let first = (*runs).brick & vec3<i32>(~side);
     leap(runs, first - region.margin, first + (side + region.margin));
 }

@@ -45,6 +45,18 @@ pub fn gpu() -> Option<Gpu> {
     }
 }
 
+/// A device that a host opened without any feature, or `None` if there is none.
+pub fn host(required_limits: wgpu::Limits) -> Option<Gpu> {
+    let name = gpu()?.name().to_owned();
+    let instance = wgpu::Instance::new(wgpu::InstanceDescriptor::new_without_display_handle());
+    let adapters = pollster::block_on(instance.enumerate_adapters(wgpu::Backends::PRIMARY));
+    let adapter =
+        adapters.into_iter().find(|adapter| adapter.get_info().name == name).expect("the same device");
+    let descriptor = wgpu::DeviceDescriptor { required_limits, ..Default::default() };
+    let (device, queue) = pollster::block_on(adapter.request_device(&descriptor)).expect("a device");
+    Some(Gpu::from_host(device, queue, name))
+}
+
 /// A channel of the values of `f` at all voxels from `min` to `max`, and of tiles of value 1.
 pub fn channel_of(
     [min, max]: [IVec3; 2],
