@@ -4,6 +4,7 @@
 //! What does not live here: pipelines ([`crate::renderer`]).
 
 use std::fmt::Write as _;
+use std::mem::offset_of;
 
 use nuage_render::color::Blackbody;
 use nuage_render::filter::Lookup;
@@ -11,11 +12,14 @@ use nuage_render::{color, envmap, hash, march, math, path, phase, surface, trave
 use nuage_volume::brick::f32_from_finite_f16;
 use nuage_volume::codec::block::{BlockFormat, PackingAxis, bc7};
 use nuage_volume::codec::{self, Codec, bounds, sparse};
-use nuage_volume::packed::{Entry, RootCell};
-use nuage_volume::space::{LOG2_BRICK, LOG2_NODE4_BRICKS, LOG2_NODE5_BRICKS, NODE4_SLOTS, NODE5_SLOTS};
+use nuage_volume::packed::{Entry, RootCell, mask};
+use nuage_volume::space::{
+    BRICK_VOXELS, LOG2_BRICK, LOG2_NODE4_BRICKS, LOG2_NODE5_BRICKS, NODE4_SLOTS, NODE5_SLOTS,
+};
 
 use crate::blocks::FORMATS;
-use crate::params::{self, MAX_LIGHTS, MAX_MEDIA};
+use crate::build;
+use crate::params::{self, Field, MAX_LIGHTS, MAX_MEDIA};
 use crate::upload::FIRST_TEXTURE;
 
 /// Pixels along each side of a workgroup.
@@ -266,6 +270,32 @@ impl Source {
     }
 }
 
+/// The shader that builds trees, into bricks of so many buffers.
+pub(crate) fn build_text(chunks: u32, log2_chunk_words: u32) -> String {
+    let features = Features { codecs: 0, chunks, log2_chunk_words, ..Features::BARE };
+    let mut text = prelude(&features);
+    for chunk in 0..chunks {
+        let binding = build::BRICKS_BINDING + chunk;
+        let _ = writeln!(
+            text,
+            "@group(0) @binding({binding}) var<storage, read_write> bricks_{chunk}: array<u32>;"
+        );
+    }
+    text += "fn set_brick_word(at: u32, word: u32) {\n";
+    let _ = writeln!(text, "    let within = at & ((1u << {log2_chunk_words}u) - 1u);");
+    let _ = writeln!(text, "    switch (at >> {log2_chunk_words}u) {{");
+    for chunk in 1..chunks {
+        let _ = writeln!(text, "        case {chunk}u: {{ bricks_{chunk}[within] = word; }}");
+    }
+    text += "        default: { bricks_0[within] = word; }\n    }\n}\n";
+    text + file!("density") + file!("build")
+}
+
+/// The shader that puts lists of voxels into dense arrays.
+pub(crate) fn scatter_text() -> String {
+    prelude(&Features::BARE) + file!("density") + file!("scatter")
+}
+
 /// Down to which layer a walk goes by itself.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Layer {
@@ -488,6 +518,22 @@ fn prelude(features: &Features) -> String {
     p.u("BRICK_LAYER", 1u32);
     p.u("VOXEL_LAYER", 0u32);
 
+    p.u("LANES", build::LANES);
+    p.u("COUNT_WORDS", build::COUNT_WORDS);
+    p.u("NODE_INFO_ROWS", build::NODE_INFO_ROWS);
+    p.u("NODE_INFO_WORDS", build::NODE_INFO_WORDS);
+    p.u("NODE4_MASK_WORDS", NODE4_SLOTS / 32);
+    p.u("NODE5_MASK_WORDS", NODE5_SLOTS / 32);
+    p.u("NODE4_MOST_WORDS", mask::most_words(NODE4_SLOTS));
+    p.u("BRICK_VOXELS", BRICK_VOXELS);
+    p.u("FIELD_WORDS", size_of::<Field>() / 4);
+    p.u("FIELD_BOUNDS_UNIT", offset_of!(Field, bounds_min) / 4 + 3);
+    p.u("FIELD_CELL_COUNT", offset_of!(Field, box_first) / 4 + 3);
+    p.u("MEANS_FOG", build::MEANS_FOG);
+    p.u("MEANS_SURFACE", build::MEANS_SURFACE);
+    p.u("MIN_F32_BITS", f32::MIN_POSITIVE.to_bits());
+    p.u("ONE", 1.0_f32.to_bits());
+
     p.f("HALF_SUBNORMAL_STEP", f32_from_finite_f16(1));
     p.u("LAST_UNIFORM_TAG", Codec::Uniform { bits: 8 }.tag());
     p.u("F16_TAG", Codec::F16.tag());
@@ -596,6 +642,14 @@ mod tests {
                 assert!(text.contains(&format!("fn {}(", source.entry_point())), "{source:?}");
             }
         }
+        for chunks in [1, 4] {
+            let text = build_text(chunks, 25);
+            validate(&text);
+            for step in build::STEPS {
+                assert!(text.contains(&format!("fn {step}(")), "{step}");
+            }
+        }
+        validate(&scatter_text());
     }
 
     #[test]
