@@ -64,6 +64,8 @@ pub(crate) struct Features {
     pub(crate) has_depth: bool,
     /// Whether a target takes encoded colours.
     pub(crate) encodes_srgb: bool,
+    /// Whether look-ups are counted in place of light.
+    pub(crate) counts: bool,
 }
 
 impl Features {
@@ -83,6 +85,7 @@ impl Features {
         sky_map: [false, false],
         has_depth: false,
         encodes_srgb: false,
+        counts: false,
     };
 
     /// All there is.
@@ -102,6 +105,7 @@ impl Features {
         sky_map: [true, true],
         has_depth: false,
         encodes_srgb: true,
+        counts: false,
     };
 
     /// Whether there is one grid and nothing else.
@@ -214,6 +218,7 @@ impl Source {
         text += picture;
         text += &brick_words(features);
         text += &block_texels(features);
+        text += if features.counts { file!("count") } else { file!("no_count") };
         COMMON.iter().for_each(|part| text += part);
         let end = if features.has_depth { file!("depth_end") } else { file!("open_end") };
         let first_voxel = hdda(&Body {
@@ -634,7 +639,7 @@ mod tests {
         let tricubic = Features { lookup: Lookup::Tricubic, glow_channel: Some(0), ..Features::BARE };
         validate(&probe());
         let textures = Features { textures: 7, ..Features::ALL };
-        let depth = Features { has_depth: true, chunks: 4, textures: 4, ..Features::ALL };
+        let depth = Features { has_depth: true, chunks: 4, textures: 4, counts: true, ..Features::ALL };
         for features in [Features::ALL, Features::BARE, tricubic, textures, depth] {
             for source in sources {
                 let text = source.text(&features);

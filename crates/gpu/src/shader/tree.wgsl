@@ -106,6 +106,7 @@ fn node5_slot(brick: vec3<i32>) -> u32 {
 
 // The region around a brick.
 fn region_at(field: u32, accessor: ptr<function, Accessor>, brick: vec3<i32>) -> Region {
+    count_region();
     let key4 = brick >> vec3<u32>(LOG2_NODE4_BRICKS);
     if ((*accessor).node4 == NONE || any((*accessor).key4 != key4)) {
         let key5 = brick >> vec3<u32>(LOG2_NODE5_BRICKS);

@@ -95,6 +95,7 @@ fn brick_of_position(field: u32, position: vec3<f32>) -> vec3<i32> {
 
 // The runs of a ray between two distances inside the field.
 fn runs_between(field: u32, ray: LocalRay, t0: f32, t1: f32) -> Runs {
+    count_ray();
     let forward = ray.direction >= vec3<f32>(0.0);
     let box_first = fields[field].box_first.xyz;
     let box_last = fields[field].box_last.xyz;
