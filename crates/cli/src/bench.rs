@@ -208,7 +208,7 @@ fn on_a_gpu(
     use nuage_gpu::renderer::Renderer;
     use nuage_gpu::upload;
     let failed = |error: nuage_gpu::error::GpuError| Failure::file(&args.input, error.to_string());
-    let arrays = arrays(args, volume, grid)?;
+    let arrays = arrays(gpu, args, volume, grid)?;
     let start = Instant::now();
     let uploaded = upload::Volume::new(gpu, &arrays).map_err(failed)?;
     gpu.wait().map_err(failed)?;
@@ -244,10 +244,15 @@ fn on_a_gpu(
     })
 }
 
-/// What is uploaded: of a packed file its bricks as they are stored, unless it is a level set, which becomes a fog.
+/// What is uploaded: of a packed file its bricks as they are stored, those of blocks in textures if the device reads them, unless it is a level set, which becomes a fog.
 #[cfg(feature = "gpu")]
-fn arrays(args: &Args, volume: &Volume, grid: &GridInfo) -> Result<nuage_gpu::arrays::Arrays, Failure> {
-    use nuage_gpu::arrays::{Arrays, Bricks, Meaning, Wanted};
+fn arrays(
+    gpu: &Gpu,
+    args: &Args,
+    volume: &Volume,
+    grid: &GridInfo,
+) -> Result<nuage_gpu::arrays::Arrays, Failure> {
+    use nuage_gpu::arrays::{Arrays, Meaning, Wanted};
     let failed = |error: &dyn std::fmt::Display| Failure::file(&args.input, error.to_string());
     let arrays = match frames::packed(&args.input) {
         Some((path, wanted)) if grid.grid_class() != "level set" => {
@@ -258,7 +263,8 @@ fn arrays(args: &Args, volume: &Volume, grid: &GridInfo) -> Result<nuage_gpu::ar
             let frame = all.find(is_wanted).unwrap_or(0);
             frames::load_frame(&mut asset, frame).map_err(|error| failed(&error))?;
             let wanted = [Wanted { name: grid.name.clone(), meaning: Meaning::Density }];
-            Arrays::of_asset(&asset, &wanted, frame..frame + 1, Bricks::AsStored)
+            let form = gpu.smallest_bricks().map_err(|error| failed(&error))?;
+            Arrays::of_asset(&asset, &wanted, frame..frame + 1, form)
         }
         _ => Arrays::of_channels(&[&volume.density]),
     };
