@@ -61,7 +61,7 @@ pub enum Meaning {
 
 impl Meaning {
     /// Scale, bias, and the largest value.
-    fn line(self) -> [f32; 3] {
+    pub(crate) fn line(self) -> [f32; 3] {
         match self {
             Meaning::Density => [1.0, 0.0, f32::MAX],
             Meaning::Fog { band } => [-1.0 / band, 0.0, 1.0],
@@ -313,6 +313,16 @@ impl Arrays {
             }
         }
         (self.words, self.shapes) = (words, shape_words);
+    }
+
+    /// Channels of one frame whose trees are built on the device, in bricks of floats.
+    pub(crate) fn of_places(places: Vec<Place>) -> Arrays {
+        let (largest, channels) = (vec![0.0; places.len()], places.len());
+        let places = places.into_iter().map(Some).collect();
+        let mut arrays =
+            Arrays { places, largest, channels, codecs: codec_bit(Codec::F32), ..Arrays::default() };
+        arrays.settle();
+        arrays
     }
 
     /// Takes the finest tree of a grid.

@@ -32,6 +32,17 @@ pub struct Depth<'a> {
     pub clip_from_world: DMat4,
 }
 
+/// What all rays of a picture look up in a volume.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Counts {
+    /// Walks through the volume, of camera rays, shadow rays and stretches of paths.
+    pub rays: u64,
+    /// Look-ups of what stands at a brick.
+    pub regions: u64,
+    /// Voxels of which the value was taken; a trilinear sample takes eight.
+    pub values: u64,
+}
+
 /// Renders one volume at a time into a picture on the device.
 #[derive(Debug)]
 pub struct Renderer {
@@ -135,15 +146,29 @@ impl Renderer {
         depth: Option<&Depth<'_>>,
     ) -> Result<(), GpuError> {
         check_frame(volume, frame)?;
-        let source = match pass {
-            Pass::View(View::Surface { .. }) | Pass::SurfaceHits { .. } => Source::Surface,
-            Pass::View(_) | Pass::Hits { .. } | Pass::Opacity { .. } => Source::Views,
-            Pass::March(_) => Source::March,
-            Pass::Path { .. } => Source::Path,
-        };
-        self.prepare_shader(volume, look, pass, frame, depth, source)
+        self.prepare_shader(volume, look, pass, frame, depth, source_of(pass), false)
     }
 
+    /// What the rays of a picture look up: runs the pass once more, with shaders that count. The picture is gone then.
+    ///
+    /// # Errors
+    /// As [`Renderer::prepare`] and [`Renderer::run`].
+    pub fn count(
+        &mut self,
+        volume: &Volume,
+        look: &Look,
+        pass: &Pass,
+        frame: usize,
+    ) -> Result<Counts, GpuError> {
+        check_frame(volume, frame)?;
+        self.prepare_shader(volume, look, pass, frame, None, source_of(pass), true)?;
+        self.run(volume)?;
+        let counted: Vec<[f32; 4]> = bytemuck::pod_collect_to_vec(&self.gpu.read(&self.picture)?);
+        let sum = |i: usize| counted.iter().map(|pixel| pixel[i] as u64).sum();
+        Ok(Counts { rays: sum(0), regions: sum(1), values: sum(2) })
+    }
+
+    #[allow(clippy::too_many_arguments, reason = "what is shown, how, and by what")]
     fn prepare_shader(
         &mut self,
         volume: &Volume,
@@ -152,9 +177,11 @@ impl Renderer {
         frame: usize,
         depth: Option<&Depth<'_>>,
         source: Source,
+        counts: bool,
     ) -> Result<(), GpuError> {
         let mut params = look.params(volume, pass, self.size, frame)?;
-        let features = features(volume, look, pass, source, depth.is_some(), params.counts[2]);
+        let features =
+            Features { counts, ..features(volume, look, pass, source, depth.is_some(), params.counts[2]) };
         if let Some(depth) = depth {
             [params.clip_x, params.clip_y, params.clip_z, params.clip_w] =
                 world_from_clip(&depth.clip_from_world, volume.origin());
@@ -188,7 +215,7 @@ impl Renderer {
         pass: &Pass,
         source: Source,
     ) -> Result<(), GpuError> {
-        self.prepare_shader(volume, look, pass, 0, None, source)?;
+        self.prepare_shader(volume, look, pass, 0, None, source, false)?;
         self.prepared = self.prepared.map(|(key, _)| (key, false));
         Ok(())
     }
@@ -456,6 +483,7 @@ fn features(
         are_densities: volume.are_densities(),
         view: if is_lit { 0 } else { view },
         encodes_srgb: false,
+        counts: false,
     }
 }
 
@@ -467,6 +495,16 @@ fn changed(new: &[u8], old: &[u8]) -> Range<usize> {
     match (units.clone().find(is_changed), units.rev().find(is_changed)) {
         (Some(first), Some(last)) => first * UNIT..new.len().min((last + 1) * UNIT),
         _ => 0..0,
+    }
+}
+
+/// The shader of a pass.
+fn source_of(pass: &Pass) -> Source {
+    match pass {
+        Pass::View(View::Surface { .. }) | Pass::SurfaceHits { .. } => Source::Surface,
+        Pass::View(_) | Pass::Hits { .. } | Pass::Opacity { .. } => Source::Views,
+        Pass::March(_) => Source::March,
+        Pass::Path { .. } => Source::Path,
     }
 }
 

@@ -4,6 +4,7 @@
 //! What does not live here: pipelines ([`crate::renderer`]).
 
 use std::fmt::Write as _;
+use std::mem::offset_of;
 
 use nuage_render::color::Blackbody;
 use nuage_render::filter::Lookup;
@@ -11,12 +12,15 @@ use nuage_render::{color, envmap, hash, march, math, path, phase, surface, trave
 use nuage_volume::brick::f32_from_finite_f16;
 use nuage_volume::codec::block::{BlockFormat, PackingAxis, bc7};
 use nuage_volume::codec::{self, Codec, bounds, sparse};
-use nuage_volume::packed::{Entry, RootCell};
-use nuage_volume::space::{LOG2_BRICK, LOG2_NODE4_BRICKS, LOG2_NODE5_BRICKS, NODE4_SLOTS, NODE5_SLOTS};
+use nuage_volume::packed::{Entry, RootCell, mask};
+use nuage_volume::space::{
+    BRICK_VOXELS, LOG2_BRICK, LOG2_NODE4_BRICKS, LOG2_NODE5_BRICKS, NODE4_SLOTS, NODE5_SLOTS,
+};
 
 use crate::blocks::FORMATS;
+use crate::build;
 use crate::maps::{self, ABSENT_TAG};
-use crate::params::{self, MAX_LIGHTS, MAX_MEDIA};
+use crate::params::{self, Field, MAX_LIGHTS, MAX_MEDIA};
 use crate::upload::FIRST_TEXTURE;
 
 /// Pixels along each side of a workgroup.
@@ -65,6 +69,8 @@ pub(crate) struct Features {
     pub(crate) view: u32,
     /// Whether a target takes encoded colours.
     pub(crate) encodes_srgb: bool,
+    /// Whether look-ups are counted in place of light.
+    pub(crate) counts: bool,
 }
 
 impl Features {
@@ -87,6 +93,7 @@ impl Features {
         are_densities: true,
         view: 0,
         encodes_srgb: false,
+        counts: false,
     };
 
     /// All there is.
@@ -109,6 +116,7 @@ impl Features {
         are_densities: false,
         view: 0,
         encodes_srgb: true,
+        counts: false,
     };
 
     /// Whether there is one grid and nothing else.
@@ -224,6 +232,7 @@ impl Source {
         text += picture;
         text += &brick_words(features);
         text += &block_texels(features);
+        text += if features.counts { file!("count") } else { file!("no_count") };
         COMMON.iter().for_each(|part| text += part);
         let end = if features.has_depth { file!("depth_end") } else { file!("open_end") };
         let first_voxel = hdda(
@@ -304,6 +313,32 @@ impl Source {
         own.iter().for_each(|part| text += part);
         text
     }
+}
+
+/// The shader that builds trees, into bricks of so many buffers.
+pub(crate) fn build_text(chunks: u32, log2_chunk_words: u32) -> String {
+    let features = Features { codecs: 0, chunks, log2_chunk_words, ..Features::BARE };
+    let mut text = prelude(&features);
+    for chunk in 0..chunks {
+        let binding = build::BRICKS_BINDING + chunk;
+        let _ = writeln!(
+            text,
+            "@group(0) @binding({binding}) var<storage, read_write> bricks_{chunk}: array<u32>;"
+        );
+    }
+    text += "fn set_brick_word(at: u32, word: u32) {\n";
+    let _ = writeln!(text, "    let within = at & ((1u << {log2_chunk_words}u) - 1u);");
+    let _ = writeln!(text, "    switch (at >> {log2_chunk_words}u) {{");
+    for chunk in 1..chunks {
+        let _ = writeln!(text, "        case {chunk}u: {{ bricks_{chunk}[within] = word; }}");
+    }
+    text += "        default: { bricks_0[within] = word; }\n    }\n}\n";
+    text + file!("density") + file!("build")
+}
+
+/// The shader that puts lists of voxels into dense arrays.
+pub(crate) fn scatter_text() -> String {
+    prelude(&Features::BARE) + file!("density") + file!("scatter")
 }
 
 /// Down to which layer a walk goes by itself.
@@ -538,6 +573,22 @@ fn prelude(features: &Features) -> String {
     p.u("BRICK_LAYER", 1u32);
     p.u("VOXEL_LAYER", 0u32);
 
+    p.u("LANES", build::LANES);
+    p.u("COUNT_WORDS", build::COUNT_WORDS);
+    p.u("NODE_INFO_ROWS", build::NODE_INFO_ROWS);
+    p.u("NODE_INFO_WORDS", build::NODE_INFO_WORDS);
+    p.u("NODE4_MASK_WORDS", NODE4_SLOTS / 32);
+    p.u("NODE5_MASK_WORDS", NODE5_SLOTS / 32);
+    p.u("NODE4_MOST_WORDS", mask::most_words(NODE4_SLOTS));
+    p.u("BRICK_VOXELS", BRICK_VOXELS);
+    p.u("FIELD_WORDS", size_of::<Field>() / 4);
+    p.u("FIELD_BOUNDS_UNIT", offset_of!(Field, bounds_min) / 4 + 3);
+    p.u("FIELD_CELL_COUNT", offset_of!(Field, box_first) / 4 + 3);
+    p.u("MEANS_FOG", build::MEANS_FOG);
+    p.u("MEANS_SURFACE", build::MEANS_SURFACE);
+    p.u("MIN_F32_BITS", f32::MIN_POSITIVE.to_bits());
+    p.u("ONE", 1.0_f32.to_bits());
+
     p.f("HALF_SUBNORMAL_STEP", f32_from_finite_f16(1));
     p.u("LAST_UNIFORM_TAG", Codec::Uniform { bits: 8 }.tag());
     p.u("F16_TAG", Codec::F16.tag());
@@ -649,7 +700,7 @@ mod tests {
         let tricubic = Features { lookup: Lookup::Tricubic, glow_channel: Some(0), ..Features::BARE };
         validate(&probe());
         let textures = Features { textures: 7, ..Features::ALL };
-        let depth = Features { has_depth: true, chunks: 4, textures: 4, ..Features::ALL };
+        let depth = Features { has_depth: true, chunks: 4, textures: 4, counts: true, ..Features::ALL };
         for features in [Features::ALL, Features::BARE, tricubic, textures, depth] {
             for source in sources {
                 let text = source.text(&features);
@@ -657,6 +708,14 @@ mod tests {
                 assert!(text.contains(&format!("fn {}(", source.entry_point())), "{source:?}");
             }
         }
+        for chunks in [1, 4] {
+            let text = build_text(chunks, 25);
+            validate(&text);
+            for step in build::STEPS {
+                assert!(text.contains(&format!("fn {step}(")), "{step}");
+            }
+        }
+        validate(&scatter_text());
     }
 
     #[test]

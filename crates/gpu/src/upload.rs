@@ -103,9 +103,8 @@ impl Volume {
     /// If that is more than the device takes, or it fails.
     pub(crate) fn with_room(gpu: &Gpu, room: Room) -> Result<Volume, GpuError> {
         let size_bytes = Volume::size_of(gpu, room)?;
-        let limits = gpu.device().limits();
-        let binding = limits.max_storage_buffer_binding_size.min(limits.max_buffer_size);
-        let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST;
+        let binding = most_bytes(gpu);
+        let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::COPY_SRC;
         let within = |what, size_bytes: u64, limit_bytes| match size_bytes <= limit_bytes {
             true => Ok(()),
             false => Err(GpuError::Limit { what, size_bytes, limit_bytes }),
@@ -251,6 +250,16 @@ impl Volume {
         (self.bricks.len() as u32, self.log2_chunk_words)
     }
 
+    /// The buffers of the tree, of fields, and of bricks.
+    pub(crate) fn parts(&self) -> (&wgpu::Buffer, &wgpu::Buffer, &[wgpu::Buffer]) {
+        (&self.tree, &self.fields, &self.bricks)
+    }
+
+    /// Says what the largest value of each channel turned out to be.
+    pub(crate) fn set_largest(&mut self, largest: impl Iterator<Item = f32>) {
+        self.arrays.largest = largest.collect();
+    }
+
     /// The buffers of the tree and of bricks, for tests of what happens if they hold anything.
     #[cfg(test)]
     pub(crate) fn buffers(&self) -> impl Iterator<Item = &wgpu::Buffer> {
@@ -271,6 +280,12 @@ impl Volume {
     pub(crate) fn place(&self, frame: usize, channel: usize) -> Option<&Place> {
         self.arrays.places.get(frame * self.arrays.channels + channel)?.as_ref()
     }
+}
+
+/// The most bytes that can be bound at once.
+pub(crate) fn most_bytes(gpu: &Gpu) -> u64 {
+    let limits = gpu.device().limits();
+    limits.max_storage_buffer_binding_size.min(limits.max_buffer_size)
 }
 
 /// A binding of a storage buffer.

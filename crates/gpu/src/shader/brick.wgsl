@@ -20,6 +20,7 @@ fn brick_of(values: Values, entry: Entry) -> Brick {
 
 // The value of the voxel of a number, as the field means it. Not only bricks have values, but parts of a tile too.
 fn brick_value(field: u32, values: Values, brick: Brick, voxel: u32) -> f32 {
+    count_value();
     let at = brick.at;
     var stored = bitcast<f32>(at);
     if (HAS_F32 && brick.tag == F32_TAG) {

@@ -3,6 +3,7 @@
 // brick and the distance is carried from one to the next, which keeps registers few.
 
 fn $NAME(field: u32, ray: LocalRay, begin: f32, end: f32, state: ptr<function, $STATE>) {
+    count_ray();
     let values = values_of(field);
     let base = fields[field].base_brick.xyz;
     let last = vec3<f32>(fields[field].box_last.xyz - base);
@@ -15,6 +16,7 @@ fn $NAME(field: u32, ray: LocalRay, begin: f32, end: f32, state: ptr<function, $
     var t = begin;
     var next_brick = clamp(floor(ray_at(ray, t) / BRICK_SIDE), vec3<f32>(1.0), last);
     while (t < end) {
+        count_region();
         let local = next_brick;
         let index = vec3<u32>(local);
         let at = map + MAP_CELL_WORDS * (index.x * row.x + index.y * row.y + index.z);

@@ -124,6 +124,7 @@ fn mapped_region(field: u32, brick: vec3<i32>) -> Region {
 
 // The region around a brick.
 fn region_at(field: u32, accessor: ptr<function, Accessor>, brick: vec3<i32>) -> Region {
+    count_region();
     if (HAS_MAPS) {
         return mapped_region(field, brick);
     }

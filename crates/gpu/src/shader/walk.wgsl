@@ -86,6 +86,7 @@ fn brick_of_position(field: u32, position: vec3<f32>) -> vec3<i32> {
 
 // The runs of a ray between two distances inside the field.
 fn runs_between(field: u32, ray: LocalRay, t0: f32, t1: f32) -> Runs {
+    count_ray();
     var runs: Runs;
     runs.field = field;
     runs.ray = ray;
