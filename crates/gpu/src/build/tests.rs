@@ -237,7 +237,10 @@ fn trees_are_those_of_the_processor() {
         assert!(entries > 50, "{name}: {entries} entries");
         let mut fields: Vec<Field> = bytemuck::pod_collect_to_vec(&fields);
         fields.iter_mut().for_each(|field| field.index_offset = [0; 4]);
-        assert_eq!(fields, reference.fields(), "{name}");
+        let mut of_reference = reference.fields();
+        // What is built has no map of bricks.
+        of_reference.iter_mut().for_each(|field| field.box_last[3] = 0);
+        assert_eq!(fields, of_reference, "{name}");
         assert_eq!(built.largest, reference.largest(0), "{name}");
         assert_eq!(built.bricks as usize * BRICK_VOXELS, reference.brick_words()[0].len(), "{name}");
     }
