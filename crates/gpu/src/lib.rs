@@ -12,13 +12,18 @@
 #![forbid(unsafe_code)]
 
 pub mod arrays;
+mod blue_noise;
+mod budget;
 pub mod device;
 pub mod error;
+mod light_volume;
 pub mod look;
 mod params;
 pub mod picture;
+pub mod real_time;
 pub mod renderer;
 mod shader;
+mod timer;
 pub mod upload;
 
 #[cfg(test)]

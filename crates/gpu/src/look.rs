@@ -13,6 +13,7 @@ use nuage_render::views::{self, View};
 use crate::error::GpuError;
 pub use crate::params::MAX_LIGHTS;
 use crate::params::{LightParams, Params, Place};
+use crate::real_time::RealTime;
 use crate::upload::Volume;
 
 /// How a volume is to look.
@@ -48,6 +49,17 @@ pub enum Pass {
     },
     /// Single scattering, as `nuage_render::march`.
     March(Quality),
+    /// Single scattering in pictures that follow each other: as [`Pass::March`], by what [`RealTime`] asks for.
+    RealTime {
+        /// How finely, where there is time.
+        quality: Quality,
+        /// By which means.
+        measures: RealTime,
+    },
+    /// The volume's shadow on a scene: the share of the sun's light that gets to each pixel of the host's depth buffer, in all
+    /// colours, with an opacity of 1. Without a depth buffer to points, which stand in the picture
+    /// ([`Renderer::set_points`](crate::renderer::Renderer::set_points)).
+    Shadow(Quality),
     /// Multiple scattering, as `nuage_render::path`: adds one path to those that each pixel has.
     ///
     /// One, so that no pass lasts long: drivers end passes of seconds, and lavapipe leaves loops after 65535 turns in all.
@@ -151,7 +163,9 @@ impl Look {
             Pass::View(view) => self.view(&mut params, volume, view, frame),
             Pass::Hits => params.counts[2] = 4,
             Pass::SurfaceHits { level } => (params.counts[2], params.view[3]) = (4, level),
-            Pass::March(quality) => self.march(&mut params, quality),
+            Pass::March(quality) | Pass::RealTime { quality, .. } | Pass::Shadow(quality) => {
+                self.march(&mut params, quality);
+            }
             Pass::Path { settings, sample } => {
                 params.size[3] = sample;
                 params.counts[1] = settings.max_scatterings.unwrap_or(u32::MAX);
@@ -177,19 +191,29 @@ impl Look {
         let is_trilinear = |lookup: &Lookup| *lookup == Lookup::Trilinear;
         match pass {
             Pass::March(Quality { lookup, .. })
+            | Pass::RealTime { quality: Quality { lookup, .. }, .. }
+            | Pass::Shadow(Quality { lookup, .. })
             | Pass::Path { settings: PathSettings { lookup, .. }, .. }
                 if !is_trilinear(lookup) =>
             {
                 unsupported("a filter that is not trilinear")
             }
-            Pass::March(Quality { shadow_step_voxels, .. }) if *shadow_step_voxels <= 0.0 => {
+            Pass::March(Quality { shadow_step_voxels, .. })
+            | Pass::RealTime { quality: Quality { shadow_step_voxels, .. }, .. }
+            | Pass::Shadow(Quality { shadow_step_voxels, .. })
+                if *shadow_step_voxels <= 0.0 =>
+            {
                 unsupported("shadow rays without steps")
             }
-            Pass::March(_) if !self.is_grey() => unsupported("an extinction with a colour in one scattering"),
-            Pass::March(_) if self.lights.len() > 1 || !self.lights.iter().all(is_point_sun) => {
+            Pass::March(_) | Pass::RealTime { .. } | Pass::Shadow(_) if !self.is_grey() => {
+                unsupported("an extinction with a colour in one scattering")
+            }
+            Pass::March(_) | Pass::RealTime { .. } | Pass::Shadow(_)
+                if self.lights.len() > 1 || !self.lights.iter().all(is_point_sun) =>
+            {
                 unsupported("lights other than one sun without extent in one scattering")
             }
-            Pass::March(_) if !matches!(self.sky, Sky::Constant(_)) => {
+            Pass::March(_) | Pass::RealTime { .. } if !matches!(self.sky, Sky::Constant(_)) => {
                 unsupported("a sky that is not the same from everywhere in one scattering")
             }
             _ => Ok(()),
@@ -219,8 +243,10 @@ impl Look {
         let Quality { step_voxels, shadow_step_voxels, shadow_growth, min_transmittance, .. } = quality;
         params.march = [step_voxels, shadow_step_voxels, shadow_growth, min_transmittance];
         let max_shadow_depth = -min_transmittance.clamp(f32::MIN_POSITIVE, 1.0).ln();
-        params.march_rays = [quality.sun_rays as f32, quality.sky_rays as f32, max_shadow_depth, 0.0];
+        params.march_rays =
+            [quality.sun_rays as f32, quality.sky_rays as f32, max_shadow_depth, shadow_step_voxels];
         params.counts[0] = quality.samples.max(1);
+        params.marched = [params.size[0], params.size[1], 1, 0];
         if let Some(Light::Sun(sun)) = self.lights.first() {
             params.sun_direction = sun.direction_to.extend(0.0).to_array();
             params.sun_irradiance = Vec3::from_array(sun.irradiance).extend(0.0).to_array();

@@ -66,10 +66,15 @@ impl Place {
         })
     }
 
+    /// The brick that positions count from.
+    pub(crate) fn base_brick(&self) -> IVec3 {
+        (self.active_box.min.saturating_sub(IVec3::ONE) >> LOG2_BRICK) - 1
+    }
+
     /// The field, in a world that begins at `origin`: as `nuage_render::traverse::Field` has it.
     pub(crate) fn field(&self, origin: DVec3) -> Field {
         let (min, max) = (self.active_box.min.saturating_sub(IVec3::ONE), self.active_box.max);
-        let base_brick: IVec3 = (min >> LOG2_BRICK) - 1;
+        let base_brick = self.base_brick();
         let base = (base_brick << LOG2_BRICK).as_dvec3();
         let index_from_world = self.world_from_index.inverse();
         let of_origin = index_from_world.transform_point3(origin) - base;
@@ -171,6 +176,19 @@ pub(crate) struct Params {
     pub(crate) clip_y: [f32; 4],
     pub(crate) clip_z: [f32; 4],
     pub(crate) clip_w: [f32; 4],
+    pub(crate) marched: [u32; 4],
+    pub(crate) light_first: [f32; 4],
+    pub(crate) light_x: [f32; 4],
+    pub(crate) light_y: [f32; 4],
+    pub(crate) light_z: [f32; 4],
+    pub(crate) light_u: [f32; 4],
+    pub(crate) light_v: [f32; 4],
+    pub(crate) light_w: [f32; 4],
+    pub(crate) before_camera: [f32; 4],
+    pub(crate) before_forward: [f32; 4],
+    pub(crate) before_right: [f32; 4],
+    pub(crate) before_up: [f32; 4],
+    pub(crate) history: [f32; 4],
     pub(crate) lights: [LightParams; MAX_LIGHTS],
 }
 
@@ -209,7 +227,8 @@ mod tests {
         assert_layout!(
             Params, "Params", camera forward right up size counts extinction albedo phase emission sky_up sky_zenith
             sky_horizon sky_ground march march_rays sun_direction sun_irradiance view tone clip_x clip_y clip_z
-            clip_w lights
+            clip_w marched light_first light_x light_y light_z light_u light_v light_w before_camera before_forward
+            before_right before_up history lights
         );
     }
 }

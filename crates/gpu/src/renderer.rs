@@ -11,8 +11,10 @@ use nuage_render::views::View;
 
 use crate::device::Gpu;
 use crate::error::GpuError;
+use crate::light_volume;
 use crate::look::{Look, Pass, world_from_clip};
 use crate::params::Params;
+use crate::real_time::Stages;
 use crate::shader::{Features, Source, WORKGROUP_SIDE, tables};
 use crate::upload::{Volume, bind, buffer_entry, storage_entry};
 
@@ -38,9 +40,21 @@ pub struct Renderer {
     depth: Option<wgpu::BindGroup>,
     pipelines: HashMap<(Source, Features), wgpu::ComputePipeline>,
     targets: HashMap<wgpu::TextureFormat, wgpu::RenderPipeline>,
-    /// What the next [`Renderer::record`] runs, and whether it starts from nothing.
-    prepared: Option<((Source, Features), bool)>,
+    /// What the next [`Renderer::record`] runs.
+    prepared: Option<Prepared>,
     current: Params,
+    /// What pictures that follow each other need, once there is one.
+    stages: Option<Stages>,
+}
+
+/// What is to be run.
+#[derive(Debug, Clone)]
+struct Prepared {
+    key: (Source, Features),
+    /// Whether the picture begins anew.
+    is_first: bool,
+    /// The look that other frames are to be shown by, of pictures that follow each other.
+    look: Option<Look>,
 }
 
 impl Renderer {
@@ -99,6 +113,7 @@ impl Renderer {
             targets: HashMap::new(),
             prepared: None,
             current: Params::default(),
+            stages: None,
         })
     }
 
@@ -123,7 +138,8 @@ impl Renderer {
         let source = match pass {
             Pass::View(View::Surface { .. }) | Pass::SurfaceHits { .. } => Source::Surface,
             Pass::View(_) | Pass::Hits => Source::Views,
-            Pass::March(_) => Source::March,
+            Pass::March(_) | Pass::RealTime { .. } => Source::March,
+            Pass::Shadow(_) => Source::Shadow,
             Pass::Path { .. } => Source::Path,
         };
         self.prepare_shader(volume, look, pass, frame, depth, source)
@@ -138,9 +154,28 @@ impl Renderer {
         depth: Option<&Depth<'_>>,
         source: Source,
     ) -> Result<(), GpuError> {
-        let mut params = look.params(volume, pass, self.size, frame)?;
+        let mut pass = *pass;
+        let mut light_step_voxels = 0.0;
+        let is_real_time = matches!(pass, Pass::RealTime { .. });
+        if let Pass::RealTime { quality, measures } = &mut pass {
+            let gpu = self.gpu.clone();
+            let wanted = quality.shadow_step_voxels;
+            *quality = self.stages()?.ask(&gpu, *quality, *measures)?;
+            light_step_voxels = wanted;
+        }
+        let mut params = look.params(volume, &pass, self.size, frame)?;
         let (chunks, log2_chunk_words) = volume.chunks();
-        let is_lit = matches!(source, Source::March | Source::Path);
+        let is_lit = matches!(source, Source::March | Source::Path | Source::Shadow);
+        let mut has_light_volume = false;
+        match self.stages.as_mut() {
+            Some(stages) if is_real_time => {
+                // Coarser steps of a picture leave the light volume as it is.
+                params.march_rays[3] = light_step_voxels;
+                has_light_volume = stages.settle(&mut params, volume, look, frame);
+            }
+            Some(stages) => stages.forget(),
+            None => {}
+        }
         let features = Features {
             codecs: volume.codecs(),
             chunks,
@@ -148,6 +183,8 @@ impl Renderer {
             glow_channel: look.glow.as_ref().filter(|_| is_lit).map(|(channel, _)| *channel as u32),
             is_grey: look.is_grey() || !is_lit,
             has_depth: depth.is_some() && is_lit,
+            is_real_time,
+            has_light_volume,
             encodes_srgb: false,
         };
         if let Some(depth) = depth {
@@ -163,19 +200,68 @@ impl Renderer {
             self.depth = Some(self.gpu.guarded(|| self.gpu.device().create_bind_group(&descriptor))?);
         }
         let key = (source, features);
-        if !self.pipelines.contains_key(&key) {
-            let pipeline = self.pipeline(volume, source, &features)?;
-            self.pipelines.insert(key, pipeline);
+        let following = [Source::LightVolume, Source::Upsample, Source::Accumulate];
+        for source in [source].into_iter().chain(following.into_iter().filter(|_| is_real_time)) {
+            if !self.pipelines.contains_key(&(source, features)) {
+                let pipeline = self.pipeline(volume, source, &features)?;
+                self.pipelines.insert((source, features), pipeline);
+            }
         }
         if let Some((_, Spectrum::Blackbody { table, .. })) = &look.glow {
             let at = 4 * tables::BLACKBODY as u64;
             let bytes = bytemuck::cast_slice(table.table());
             self.gpu.guarded(|| self.gpu.queue().write_buffer(volume.tables(), at, bytes))?;
         }
-        let is_first = !matches!(pass, Pass::Path { sample: 1.., .. });
-        self.prepared = Some((key, is_first));
+        let goes_on = matches!(pass, Pass::Path { sample: 1.., .. } | Pass::RealTime { .. });
+        let is_of_points = matches!(pass, Pass::Shadow(_)) && depth.is_none();
+        let look = is_real_time.then(|| look.clone());
+        self.prepared = Some(Prepared { key, is_first: !goes_on && !is_of_points, look });
         self.current = params;
         self.write_params()
+    }
+
+    /// What pictures that follow each other need.
+    fn stages(&mut self) -> Result<&mut Stages, GpuError> {
+        let stages = match self.stages.take() {
+            Some(stages) => stages,
+            None => {
+                let [(pass_layout, _), _] = &self.groups;
+                Stages::new(&self.gpu, self.size, pass_layout, &self.params, &self.picture)?
+            }
+        };
+        Ok(self.stages.insert(stages))
+    }
+
+    /// Sets the points whose light [`Pass::Shadow`] asks for: as many as there are pixels, counted from the place of the look's
+    /// camera, so that they are precise wherever that is.
+    ///
+    /// # Errors
+    /// If there are too many, or the device fails.
+    pub fn set_points(&self, points: &[[f32; 3]]) -> Result<(), GpuError> {
+        let [width, height] = self.size;
+        if points.len() as u64 > u64::from(width) * u64::from(height) {
+            return Err(GpuError::Misuse(format!("{} points in {width} x {height} pixels", points.len())));
+        }
+        let wide: Vec<[f32; 4]> = points.iter().map(|[x, y, z]| [*x, *y, *z, 0.0]).collect();
+        let bytes = bytemuck::cast_slice(&wide);
+        self.gpu.guarded(|| self.gpu.queue().write_buffer(&self.picture, 0, bytes))
+    }
+
+    /// The picture on the device, row by row, as four floats for each pixel: to be read by a host's shaders.
+    pub fn picture(&self) -> &wgpu::Buffer {
+        &self.picture
+    }
+
+    /// Says how long the last picture took, on a device without timestamps: what a budget goes by.
+    pub fn took(&mut self, milliseconds: f32) {
+        if let Some(stages) = self.stages.as_mut() {
+            stages.told(milliseconds);
+        }
+    }
+
+    /// The milliseconds that the last picture took of those with a budget whose time is known.
+    pub fn took_ms(&self) -> Option<f32> {
+        self.stages.as_ref().and_then(Stages::took_ms)
     }
 
     /// As [`Renderer::prepare`], for a shader of tests, which goes on from what the picture holds.
@@ -188,7 +274,7 @@ impl Renderer {
         source: Source,
     ) -> Result<(), GpuError> {
         self.prepare_shader(volume, look, pass, 0, None, source)?;
-        self.prepared = self.prepared.map(|(key, _)| (key, false));
+        self.prepared = self.prepared.take().map(|prepared| Prepared { is_first: false, ..prepared });
         Ok(())
     }
 
@@ -207,6 +293,12 @@ impl Renderer {
     pub fn set_frame(&mut self, volume: &Volume, frame: usize) -> Result<(), GpuError> {
         check_frame(volume, frame)?;
         self.current.size[2] = frame as u32;
+        let look = self.prepared.as_ref().and_then(|prepared| prepared.look.as_ref());
+        if let (Some(look), Some(stages)) = (look, self.stages.as_ref()) {
+            // A light volume lies elsewhere around another frame.
+            stages.settle(&mut self.current, volume, look, frame);
+            return self.write_params();
+        }
         let at = (std::mem::offset_of!(Params, size) + 2 * size_of::<u32>()) as u64;
         let bytes = (frame as u32).to_le_bytes();
         self.gpu.guarded(|| self.gpu.queue().write_buffer(&self.params, at, &bytes))
@@ -231,10 +323,15 @@ impl Renderer {
                 source: wgpu::ShaderSource::Wgsl(text.into()),
             });
             let [(pass_layout, _), _] = &self.groups;
-            let mut layouts = vec![Some(volume.layout()), Some(pass_layout)];
-            if features.has_depth {
-                layouts.push(Some(&self.depth_layout));
-            }
+            let has_volume = !matches!(source, Source::Upsample | Source::Accumulate);
+            let has_depth = features.has_depth && source != Source::LightVolume;
+            let own = self.stages.as_ref().filter(|_| features.is_real_time);
+            let layouts = [
+                has_volume.then_some(volume.layout()),
+                Some(pass_layout),
+                has_depth.then_some(&self.depth_layout),
+                own.and_then(|stages| stages.layout(source)),
+            ];
             let layout = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
                 label: Some(source.entry_point()),
                 bind_group_layouts: &layouts,
@@ -257,22 +354,63 @@ impl Renderer {
     /// If nothing was prepared.
     pub fn record(&mut self, encoder: &mut wgpu::CommandEncoder, volume: &Volume) -> Result<(), GpuError> {
         let nothing = || GpuError::Misuse("nothing was prepared to be recorded".to_owned());
-        let (key, is_first) = self.prepared.ok_or_else(nothing)?;
-        let pipeline = self.pipelines.get(&key).ok_or_else(nothing)?;
+        let Prepared { key: (source, features), is_first, .. } =
+            *self.prepared.as_ref().ok_or_else(nothing)?;
         if is_first {
             encoder.clear_buffer(&self.picture, 0, None);
         }
-        let descriptor = wgpu::ComputePassDescriptor { label: Some("nuage"), timestamp_writes: None };
-        let mut pass = encoder.begin_compute_pass(&descriptor);
-        pass.set_pipeline(pipeline);
-        pass.set_bind_group(0, volume.bind_group(), &[]);
-        let [(_, group), _] = &self.groups;
-        pass.set_bind_group(1, group, &[]);
-        if let Some(depth) = self.depth.as_ref().filter(|_| key.1.has_depth) {
-            pass.set_bind_group(2, depth, &[]);
+        let real_time = self.stages.as_mut().filter(|_| features.is_real_time);
+        let sources = match real_time {
+            Some(stages) => {
+                let sources = stages.advance(&mut self.current, volume, features.has_light_volume);
+                self.write_params()?;
+                sources
+            }
+            None => vec![source],
+        };
+        let [(_, to_picture), _] = &self.groups;
+        let stages = self.stages.as_ref().filter(|_| features.is_real_time);
+        let timer = stages.and_then(Stages::timer);
+        for (i, source) in sources.iter().enumerate() {
+            let pipeline = self.pipelines.get(&(*source, features)).ok_or_else(nothing)?;
+            let timestamp_writes = timer.map(|timer| timer.writes(i == 0, i + 1 == sources.len()));
+            let descriptor = wgpu::ComputePassDescriptor {
+                label: Some(source.entry_point()),
+                timestamp_writes: timestamp_writes.filter(|_| i == 0 || i + 1 == sources.len()),
+            };
+            if let Some(stages) = stages.filter(|_| *source == Source::Accumulate) {
+                stages.keep(encoder, &self.picture);
+            }
+            let mut pass = encoder.begin_compute_pass(&descriptor);
+            pass.set_pipeline(pipeline);
+            if !matches!(source, Source::Upsample | Source::Accumulate) {
+                pass.set_bind_group(0, volume.bind_group(), &[]);
+            }
+            // What is not yet the picture goes to the next stage.
+            let target = match (stages, source) {
+                (Some(stages), Source::March) if sources.last() != Some(source) => &stages.marched,
+                (Some(stages), Source::Upsample) if sources.last() != Some(source) => &stages.upsampled,
+                _ => to_picture,
+            };
+            pass.set_bind_group(1, target, &[]);
+            let depth = self.depth.as_ref().filter(|_| features.has_depth && *source != Source::LightVolume);
+            if let Some(depth) = depth {
+                pass.set_bind_group(2, depth, &[]);
+            }
+            if let Some(stages) = stages {
+                pass.set_bind_group(3, stages.group(*source), &[]);
+            }
+            let size = match source {
+                Source::LightVolume => [light_volume::NODES; 2],
+                Source::March if features.is_real_time => [self.current.marched[0], self.current.marched[1]],
+                _ => self.size,
+            };
+            let [x, y] = size.map(|side| side.div_ceil(WORKGROUP_SIDE));
+            pass.dispatch_workgroups(x, y, 1);
         }
-        let [x, y] = self.size.map(|side| side.div_ceil(WORKGROUP_SIDE));
-        pass.dispatch_workgroups(x, y, 1);
+        if let Some(stages) = self.stages.as_mut().filter(|_| features.is_real_time) {
+            stages.send_times_back(encoder);
+        }
         Ok(())
     }
 
@@ -329,6 +467,8 @@ impl Renderer {
             glow_channel: None,
             is_grey: true,
             has_depth: false,
+            is_real_time: false,
+            has_light_volume: false,
             encodes_srgb: is_unorm,
         };
         let text = Source::Tone.text(&features);

@@ -14,6 +14,7 @@ use nuage_volume::packed::{Entry, RootCell};
 use nuage_volume::space::{LOG2_BRICK, LOG2_NODE4_BRICKS, LOG2_NODE5_BRICKS, NODE4_SLOTS, NODE5_SLOTS};
 
 use crate::params::{self, MAX_LIGHTS};
+use crate::{blue_noise, light_volume, real_time};
 
 /// Pixels along each side of a workgroup.
 pub(crate) const WORKGROUP_SIDE: u32 = 8;
@@ -37,6 +38,10 @@ pub(crate) struct Features {
     pub(crate) is_grey: bool,
     /// Whether rays end at a host's depth buffer.
     pub(crate) has_depth: bool,
+    /// Whether pictures follow each other, with what `real_time.wgsl` does for them.
+    pub(crate) is_real_time: bool,
+    /// Whether the sun's light is read from the light volume.
+    pub(crate) has_light_volume: bool,
     /// Whether a target takes encoded colours.
     pub(crate) encodes_srgb: bool,
 }
@@ -51,6 +56,8 @@ impl Features {
         glow_channel: Some(1),
         is_grey: false,
         has_depth: false,
+        is_real_time: false,
+        has_light_volume: false,
         encodes_srgb: true,
     };
 }
@@ -87,6 +94,14 @@ pub(crate) enum Source {
     March,
     /// The path tracer.
     Path,
+    /// The light volume.
+    LightVolume,
+    /// From pictures of a quarter of the pixels to all of them.
+    Upsample,
+    /// The mean of pictures that follow each other.
+    Accumulate,
+    /// The volume's shadow on a scene.
+    Shadow,
     /// From sums of light to a target.
     Tone,
     /// Small functions over many inputs, for tests.
@@ -122,6 +137,10 @@ impl Source {
             Source::Surface => "surface",
             Source::March => "march",
             Source::Path => "path",
+            Source::LightVolume => "light_volume",
+            Source::Upsample => "upsample",
+            Source::Accumulate => "accumulate",
+            Source::Shadow => "shadow",
             Source::Tone => "tone",
             #[cfg(test)]
             Source::Twins => "twins",
@@ -143,6 +162,7 @@ impl Source {
         text += &brick_words(features);
         COMMON.iter().for_each(|part| text += part);
         let end = if features.has_depth { file!("depth_end") } else { file!("open_end") };
+        let kind = if features.is_real_time { file!("real_time") } else { file!("still") };
         let first_voxel = hdda(&Body {
             name: "meet_voxel",
             state: "VoxelHit",
@@ -157,7 +177,13 @@ impl Source {
         let own: &[&str] = match self {
             Source::Views => &[file!("camera"), file!("cells"), file!("views"), &first_voxel],
             Source::Surface => &[file!("camera"), file!("cells"), file!("surface")],
-            Source::March => &[file!("camera"), file!("emission"), end, file!("march")],
+            Source::March => &[file!("camera"), file!("emission"), end, kind, file!("march")],
+            Source::Shadow => {
+                &[file!("camera"), file!("emission"), end, file!("still"), file!("march"), file!("shadow")]
+            }
+            Source::LightVolume => &[file!("camera"), file!("light_volume")],
+            Source::Upsample => &[file!("camera"), end, file!("upsample")],
+            Source::Accumulate => &[file!("camera"), end, file!("accumulate")],
             Source::Path => &[file!("camera"), file!("emission"), end, file!("light"), file!("path")],
             Source::Tone => &[],
             #[cfg(test)]
@@ -411,6 +437,13 @@ fn prelude(features: &Features) -> String {
     p.u("GLOW_CHANNEL", features.glow_channel.unwrap_or(0));
     p.b("HAS_EMISSION", features.glow_channel.is_some());
     p.b("IS_GREY", features.is_grey);
+    p.b("HAS_DEPTH", features.has_depth);
+    p.b("HAS_LIGHT_VOLUME", features.has_light_volume);
+    p.u("LIGHT_NODES", light_volume::NODES);
+    p.u("NOISE_SIDE", blue_noise::SIDE);
+    p.f("LEAST_WEIGHT", real_time::LEAST_WEIGHT);
+    p.f("UPSAMPLE_TOLERANCE", real_time::UPSAMPLE_TOLERANCE);
+    p.f("KEPT_TOLERANCE", real_time::KEPT_TOLERANCE);
     p.b("ENCODES_SRGB", features.encodes_srgb);
     for (i, name) in
         ["VIEW_DENSITY", "VIEW_DEPTH", "VIEW_INDEX", "VIEW_FIRST_DENSITY", "VIEW_HITS"].iter().enumerate()
@@ -435,10 +468,22 @@ mod tests {
 
     #[test]
     fn every_entry_point_is_valid() {
-        let sources =
-            [Source::Views, Source::Surface, Source::March, Source::Path, Source::Tone, Source::Twins];
+        let sources = [
+            Source::Views,
+            Source::Surface,
+            Source::March,
+            Source::Path,
+            Source::LightVolume,
+            Source::Upsample,
+            Source::Accumulate,
+            Source::Shadow,
+            Source::Tone,
+            Source::Twins,
+        ];
         let bare = Features { codecs: 0, chunks: 1, glow_channel: None, is_grey: true, ..Features::ALL };
-        for features in [Features::ALL, bare, Features { has_depth: true, chunks: 4, ..Features::ALL }] {
+        let cut = Features { has_depth: true, chunks: 4, ..Features::ALL };
+        let real_time = Features { is_real_time: true, has_light_volume: true, ..cut };
+        for features in [Features::ALL, bare, cut, real_time] {
             for source in sources {
                 let text = source.text(&features);
                 validate(&text);
