@@ -6,8 +6,8 @@ mod common;
 
 use std::sync::Arc;
 
-use common::{cloud, gpu, lit, packed, picture, uploaded};
-use glam::{DVec3, Vec3};
+use common::{gpu, lit, packed, picture, uploaded};
+use glam::{DVec3, IVec3, Vec3};
 use nuage_gpu::arrays::{Arrays, Bricks, Meaning, Wanted};
 use nuage_gpu::device::Gpu;
 use nuage_gpu::error::GpuError;
@@ -23,13 +23,14 @@ use nuage_render::light::Light;
 use nuage_render::march::Quality;
 use nuage_render::traverse::Field;
 use nuage_vdb::{AnyTree, Map};
+use nuage_volume::channel::Channel;
 
 /// As a picture is without any measure.
 const NONE: RealTime =
     RealTime { light_volume: false, half_resolution: false, accumulate: false, budget_ms: None };
 
 /// Coarse, as real time has it.
-const COARSE: Quality = Quality { step_voxels: 2.0, sky_rays: 2, sun_rays: 8, ..FINE };
+const COARSE: Quality = Quality { step_voxels: 2.0, sky_rays: 1, sun_rays: 4, ..FINE };
 
 /// Finer than what is compared with it.
 const FINE: Quality = Quality {
@@ -43,6 +44,23 @@ const FINE: Quality = Quality {
     lookup: nuage_render::filter::Lookup::Trilinear,
 };
 
+/// Small, since dozens of pictures are made.
+fn small(gpu: &Gpu) -> Renderer {
+    Renderer::new(gpu, [48, 27]).expect("a renderer")
+}
+
+/// A cloud of 36 voxels across.
+fn puff() -> Channel {
+    common::channel_of([IVec3::splat(-18), IVec3::splat(17)], common::bent(), &[], |voxel| {
+        let p = voxel.as_vec3();
+        (2.0 - p.length() / 8.0 + common::noise(p / 5.0)).clamp(0.0, 1.0)
+            * (0.3 + 0.7 * common::noise(p / 3.0))
+    })
+}
+
+/// As coarse, but for the noise of rays to the sky.
+const MANY: Quality = Quality { sky_rays: 24, ..COARSE };
+
 type Pixels = Vec<[f32; 4]>;
 
 fn shown(
@@ -55,14 +73,18 @@ fn shown(
     picture(renderer, volume, look, &Pass::RealTime { quality, measures }, 0)
 }
 
-/// The mean error in all channels, and the root of its mean square, in parts of the brightest light.
+/// The mean error of the light, and the root of its mean square, in parts of what there is in the mean where there is some.
 fn errors(ours: &[[f32; 4]], reference: &[[f32; 4]]) -> [f64; 2] {
-    let brightest = reference.iter().flatten().copied().fold(f32::MIN_POSITIVE, f32::max);
-    let pairs = ours.iter().flatten().zip(reference.iter().flatten());
-    let errors: Vec<f64> = pairs.map(|(a, b)| f64::from((a - b) / brightest)).collect();
-    let count = errors.len() as f64;
-    let mean = errors.iter().map(|error| error.abs()).sum::<f64>() / count;
-    [mean, (errors.iter().map(|error| error * error).sum::<f64>() / count).sqrt()]
+    let light = |pixel: &[f32; 4]| f64::from(pixel[0] + pixel[1] + pixel[2]) / 3.0;
+    let seen = |(_, b): &(&[f32; 4], &[f32; 4])| b[3] > 0.0;
+    let pairs: Vec<[f64; 2]> =
+        ours.iter().zip(reference).filter(seen).map(|(a, b)| [light(a), light(b)]).collect();
+    assert!(pairs.len() > reference.len() / 10, "only {} pixels show anything", pairs.len());
+    let count = pairs.len() as f64;
+    let there_is = pairs.iter().map(|[_, b]| b).sum::<f64>() / count;
+    let mean = pairs.iter().map(|[a, b]| (a - b).abs()).sum::<f64>() / count;
+    let square = pairs.iter().map(|[a, b]| (a - b) * (a - b)).sum::<f64>() / count;
+    [mean / there_is, square.sqrt() / there_is]
 }
 
 /// Two frames: a volume, and the same one elsewhere.
@@ -97,10 +119,10 @@ fn look_of_frames() -> Look {
 #[test]
 fn a_light_volume_stands_for_shadow_rays() {
     let Some(gpu) = gpu() else { return };
-    let channel = cloud();
+    let channel = puff();
     let (volume, scene) = (uploaded(&gpu, &[&channel]), lit(&channel));
     let mut look = Look::of_scene(&scene).expect("a look");
-    let mut renderer = common::renderer(&gpu);
+    let mut renderer = small(&gpu);
     let quality = Quality { sky_rays: 0, ..FINE };
     let rays = shown(&mut renderer, &volume, &look, quality, NONE);
     let alone = picture(&mut renderer, &volume, &look, &Pass::March(quality), 0);
@@ -111,7 +133,7 @@ fn a_light_volume_stands_for_shadow_rays() {
     println!(
         "light volume: mean {mean:.2e}, deviation {deviation:.2e}; of steps that begin elsewhere {mean_alone:.2e}, {deviation_alone:.2e}"
     );
-    assert!(mean < 5e-3 && deviation < 1.2e-2, "{mean} {deviation}");
+    assert!(mean < 1.5e-2 && deviation < 2.5e-2, "{mean} {deviation}");
     assert!(mean_alone < 3e-3 && deviation_alone > 0.0, "{mean_alone} {deviation_alone}");
     // Light from elsewhere fills it anew.
     if let Some(Light::Sun(sun)) = look.lights.first_mut() {
@@ -122,7 +144,7 @@ fn a_light_volume_stands_for_shadow_rays() {
     let [mean, deviation] = errors(&turned, &rays);
     println!("from elsewhere: mean {mean:.2e}, deviation {deviation:.2e}");
     assert!(
-        mean < 5e-3 && deviation < 1.2e-2 && errors(&cached, &rays)[0] > 2.0 * mean,
+        mean < 1.5e-2 && deviation < 2.5e-2 && errors(&cached, &rays)[0] > 2.0 * mean,
         "{mean} {deviation}"
     );
 
@@ -133,99 +155,101 @@ fn a_light_volume_stands_for_shadow_rays() {
     renderer.set_frame(&volume, 1).expect("a frame");
     renderer.run(&volume).expect("a run");
     let switched = renderer.pixels().expect("pixels");
-    let fresh = picture(&mut common::renderer(&gpu), &volume, &look, &pass, 1);
+    let fresh = picture(&mut small(&gpu), &volume, &look, &pass, 1);
     assert_eq!(switched, fresh);
 }
 
-/// A still camera: pictures of few and coarse steps come to be the one of many and fine ones.
+/// A still camera: pictures of one ray to the sky each come to be the one of many, as the root of their number, and those of
+/// a quarter of the pixels too.
 #[test]
 fn accumulated_pictures_converge() {
     let Some(gpu) = gpu() else { return };
-    let channel = cloud();
+    let channel = puff();
     let (volume, scene) = (uploaded(&gpu, &[&channel]), lit(&channel));
     let look = Look::of_scene(&scene).expect("a look");
-    let mut renderer = common::renderer(&gpu);
-    let many = Quality { samples: 1, sun_rays: 32, sky_rays: 64, step_voxels: 0.5, ..FINE };
-    let reference = picture(&mut renderer, &volume, &look, &Pass::March(many), 0);
+    let mut renderer = small(&gpu);
+    let reference = picture(&mut renderer, &volume, &look, &Pass::March(MANY), 0);
     for half_resolution in [false, true] {
         let measures = RealTime { accumulate: true, half_resolution, ..NONE };
-        let mut renderer = common::renderer(&gpu);
+        let mut renderer = small(&gpu);
         let first = shown(&mut renderer, &volume, &look, COARSE, measures);
         let mut last = Vec::new();
-        for _ in 1..48 {
+        for _ in 1..24 {
             last = shown(&mut renderer, &volume, &look, COARSE, measures);
         }
         let ([_, before], [mean, after]) = (errors(&first, &reference), errors(&last, &reference));
         println!(
             "half {half_resolution}: deviation {before:.2e} of the first, {after:.2e} and mean {mean:.2e} of the last"
         );
-        assert!(after < 0.3 * before && after < 1e-2, "{before} {after}");
+        assert!(after < 0.4 * before, "{before} {after}");
     }
 }
 
-/// Nothing of a frame stays when another is shown: where that is empty there is nothing at once, and elsewhere soon what its
-/// own pictures show. Nor does anything stay where it was when the camera moves.
+/// Nothing of a frame stays when another is shown: where that is empty there is nothing at once, and elsewhere pictures are as
+/// near to its own as if there had never been another. The same goes for a camera that leaps.
 #[test]
 fn nothing_stays_that_is_gone() {
     let Some(gpu) = gpu() else { return };
     let (volume, mut look) = (two_frames(&gpu), look_of_frames());
     let measures = RealTime { accumulate: true, ..NONE };
     let pass = Pass::RealTime { quality: COARSE, measures };
-    let settled = |look: &Look, frame: usize| {
-        let mut renderer = common::renderer(&gpu);
-        (0..32).for_each(|_| drop(picture(&mut renderer, &volume, look, &pass, frame)));
-        renderer.pixels().expect("pixels")
+    let mut renderer = small(&gpu);
+    let old = picture(&mut renderer, &volume, &look, &Pass::March(MANY), 0);
+    let new = picture(&mut renderer, &volume, &look, &Pass::March(MANY), 1);
+    // Where pixels around show something, a mean is held to that.
+    let is_clear = |i: usize| {
+        let [x, y] = [(i % 48) as i32, (i / 48) as i32];
+        common::boxed(IVec3::new(x - 1, y - 1, 0), IVec3::new(x + 1, y + 1, 0)).all(|p| {
+            new.get((p.y.clamp(0, 26) * 48 + p.x.clamp(0, 47)) as usize).is_some_and(|p| p[3] == 0.0)
+        })
     };
-    let (old, new) = (settled(&look, 0), settled(&look, 1));
-    let mut renderer = common::renderer(&gpu);
-    (0..16).for_each(|_| drop(picture(&mut renderer, &volume, &look, &pass, 0)));
+    let gone: Vec<usize> = (0..new.len()).filter(|i| old[*i][3] > 0.1 && is_clear(*i)).collect();
+    assert!(gone.len() > 100, "{}", gone.len());
+    (0..6).for_each(|_| drop(picture(&mut renderer, &volume, &look, &pass, 0)));
     renderer.set_frame(&volume, 1).expect("a frame");
-    for number in 1..=4 {
+    let mut fresh = small(&gpu);
+    for number in 1..=3 {
         renderer.run(&volume).expect("a run");
         let pixels = renderer.pixels().expect("pixels");
-        let gone = |i: usize| old[i][3] > 0.1 && new[i][3] == 0.0;
-        let gone: Vec<usize> = (0..new.len()).filter(|i| gone(*i)).collect();
-        // Its neighbours may show something, to which it is held.
-        let ghosts = gone.iter().filter(|i| pixels[**i][3] > 0.02).count();
-        let [mean, deviation] = errors(&pixels, &new);
+        let ghosts = gone.iter().filter(|i| pixels[**i] != [0.0; 4]).count();
+        let [_, deviation] = errors(&pixels, &new);
+        let [_, alone] = errors(&picture(&mut fresh, &volume, &look, &pass, 1), &new);
         println!(
-            "{number} after: {ghosts} of {} ghosts, mean {mean:.2e}, deviation {deviation:.2e}",
+            "{number} after: {ghosts} of {} ghosts, deviation {deviation:.2e} and {alone:.2e} alone",
             gone.len()
         );
-        assert!(gone.len() > 200 && ghosts == 0, "{ghosts} of {}", gone.len());
-        assert!(number < 4 || deviation < 2.5e-2, "{deviation}");
+        assert!(ghosts == 0 && deviation < 1.2 * alone, "{ghosts} of {}, {deviation} {alone}", gone.len());
     }
-    // The camera goes aside by some pixels.
-    look.camera.origin += look.camera.right * 0.1 * (look.camera.origin - DVec3::ZERO).length();
-    let new = settled(&look, 1);
-    for _ in 0..3 {
-        drop(picture(&mut renderer, &volume, &look, &pass, 1));
+    look.camera.origin += look.camera.right * 0.1 * look.camera.origin.length();
+    let new = picture(&mut small(&gpu), &volume, &look, &Pass::March(MANY), 1);
+    let mut fresh = small(&gpu);
+    for number in 1..=2 {
+        let [_, deviation] = errors(&picture(&mut renderer, &volume, &look, &pass, 1), &new);
+        let [_, alone] = errors(&picture(&mut fresh, &volume, &look, &pass, 1), &new);
+        println!("{number} after a leap: deviation {deviation:.2e} and {alone:.2e} alone");
+        assert!(deviation < 1.2 * alone, "{deviation} {alone}");
     }
-    let pixels = renderer.pixels().expect("pixels");
-    let [mean, deviation] = errors(&pixels, &new);
-    println!("moved: mean {mean:.2e}, deviation {deviation:.2e}");
-    assert!(deviation < 3e-2, "{deviation}");
 }
 
 /// What a camera sees that goes on moving is smoother than single pictures: it is found again.
 #[test]
 fn moving_cameras_find_the_medium_again() {
     let Some(gpu) = gpu() else { return };
-    let channel = cloud();
+    let channel = puff();
     let (volume, scene) = (uploaded(&gpu, &[&channel]), lit(&channel));
     let mut look = Look::of_scene(&scene).expect("a look");
-    let quality = Quality { sky_rays: 1, sun_rays: 4, step_voxels: 4.0, ..FINE };
+    let quality = COARSE;
     let measures = RealTime { accumulate: true, ..NONE };
-    let mut renderer = common::renderer(&gpu);
+    let mut renderer = small(&gpu);
     let aside = look.camera.right * 0.002 * (look.camera.origin - DVec3::new(100.0, -20.0, 5.0)).length();
     let mut last = Vec::new();
-    for _ in 0..16 {
+    for _ in 0..8 {
         look.camera.origin += aside;
         last = shown(&mut renderer, &volume, &look, quality, measures);
     }
-    let mut renderer = common::renderer(&gpu);
+    let mut renderer = small(&gpu);
     let single = shown(&mut renderer, &volume, &look, quality, measures);
-    let fine = Quality { sky_rays: 64, sun_rays: 32, ..FINE };
+    let fine = Quality { sky_rays: 24, ..quality };
     let reference = picture(&mut renderer, &volume, &look, &Pass::March(fine), 0);
     let ([_, one], [_, many]) = (errors(&single, &reference), errors(&last, &reference));
     println!("moving: deviation {one:.2e} of a picture alone, {many:.2e} of one that follows others");
@@ -236,10 +260,10 @@ fn moving_cameras_find_the_medium_again() {
 #[test]
 fn a_quarter_of_the_pixels_is_brought_to_all() {
     let Some(gpu) = gpu() else { return };
-    let channel = cloud();
+    let channel = puff();
     let (volume, scene) = (uploaded(&gpu, &[&channel]), lit(&channel));
     let look = Look::of_scene(&scene).expect("a look");
-    let mut renderer = common::renderer(&gpu);
+    let mut renderer = small(&gpu);
     let quality = Quality { sky_rays: 0, ..FINE };
     // A budget that is never reached measures.
     let timed = RealTime { budget_ms: Some(f32::MAX), ..NONE };
@@ -261,7 +285,7 @@ fn a_quarter_of_the_pixels_is_brought_to_all() {
     println!(
         "a quarter: mean {mean:.2e}, deviation {deviation:.2e}, {quarter_ms:.1} ms instead of {all_ms:.1}"
     );
-    assert!(mean < 8e-3 && deviation < 2.5e-2 && deviation > 0.0, "{mean} {deviation}");
+    assert!(mean < 0.1 && deviation < 0.2 && deviation > 0.0, "{mean} {deviation}");
     assert!(all_ms.is_infinite() || quarter_ms < 0.6 * all_ms, "{quarter_ms} of {all_ms}");
 }
 
@@ -269,7 +293,7 @@ fn a_quarter_of_the_pixels_is_brought_to_all() {
 #[test]
 fn points_get_the_light_that_the_volume_leaves() {
     let Some(gpu) = gpu() else { return };
-    let channel = cloud();
+    let channel = puff();
     let (volume, scene) = (uploaded(&gpu, &[&channel]), lit(&channel));
     let look = Look::of_scene(&scene).expect("a look");
     let Some(Light::Sun(sun)) = look.lights.first() else { panic!("no sun") };
@@ -300,7 +324,7 @@ fn points_get_the_light_that_the_volume_leaves() {
         shaded += usize::from(expected < 0.9);
     }
     println!("{shaded} of 1000 points are shaded, the worst is off by {worst:.2e}");
-    assert!(shaded > 200 && worst < 4e-3, "{shaded} {worst}");
+    assert!(shaded > 100 && worst < 4e-3, "{shaded} {worst}");
     let too_many = renderer.set_points(&vec![[0.0; 3]; 1001]);
     assert!(matches!(too_many, Err(GpuError::Misuse(_))), "{too_many:?}");
 }
@@ -309,10 +333,10 @@ fn points_get_the_light_that_the_volume_leaves() {
 #[test]
 fn pictures_take_no_longer_than_they_may() {
     let Some(gpu) = gpu() else { return };
-    let channel = cloud();
+    let channel = puff();
     let (volume, scene) = (uploaded(&gpu, &[&channel]), lit(&channel));
     let look = Look::of_scene(&scene).expect("a look");
-    let mut renderer = common::renderer(&gpu);
+    let mut renderer = small(&gpu);
     let mut took = |budget_ms: f32| {
         let pass =
             Pass::RealTime { quality: FINE, measures: RealTime { budget_ms: Some(budget_ms), ..NONE } };
@@ -325,8 +349,7 @@ fn pictures_take_no_longer_than_they_may() {
     };
     let unbounded = (0..4).map(|_| took(f32::MAX)).fold(f32::INFINITY, f32::min);
     let budget_ms = unbounded / 3.0;
-    (0..12).for_each(|_| drop(took(budget_ms)));
-    let mut times: Vec<f32> = (0..9).map(|_| took(budget_ms)).collect();
+    let mut times: Vec<f32> = (0..21).map(|_| took(budget_ms)).skip(12).collect();
     times.sort_by(f32::total_cmp);
     println!("{unbounded:.1} ms without a bound; of {budget_ms:.1} ms pictures take {times:.1?}");
     // Others use this machine too.
