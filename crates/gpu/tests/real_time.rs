@@ -97,9 +97,8 @@ fn two_frames(gpu: &Gpu) -> Volume {
         other => panic!("{}", other.value_type()),
     };
     if let Map::Linear(matrix) = &mut second.transform.map {
-        for axis in 0..3 {
-            matrix[3][axis] += 20.0 * matrix[0][axis];
-        }
+        let aside = matrix[0].map(|x| 20.0 * x);
+        matrix[3].iter_mut().zip(aside).take(3).for_each(|(x, aside)| *x += aside);
     }
     let asset = packed(&[vec![first], vec![second]], &Options::default());
     let wanted = [Wanted { name: "density".to_owned(), meaning: Meaning::Density }];
