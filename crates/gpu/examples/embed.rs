@@ -11,7 +11,7 @@ use glam::{DAffine3, DMat3, DMat4, DVec3, DVec4, IVec3, Vec3};
 use nuage_gpu::arrays::Arrays;
 use nuage_gpu::device::Gpu;
 use nuage_gpu::error::GpuError;
-use nuage_gpu::look::{Look, Pass};
+use nuage_gpu::look::{Look, Medium, MediumPlace, Pass};
 use nuage_gpu::renderer::{Depth, Renderer};
 use nuage_gpu::upload::Volume;
 use nuage_render::camera::Camera;
@@ -78,12 +78,17 @@ fn main() -> Result<(), Box<dyn Error>> {
     let gpu = Gpu::from_host(device.clone(), queue.clone(), adapter.get_info().name);
     let volume = Volume::new(&gpu, &Arrays::of_channels(&[&ball()?])?)?;
     let sun = Sun::point(Vec3::new(0.6, 0.8, 0.0), [3.0; 3]);
-    let look = Look {
-        camera,
+    let medium = Medium {
+        place: MediumPlace::Channel(0),
+        coarse: None,
         extinction: [4.0; 3],
         albedo: [0.9; 3],
         phase: Phase::HenyeyGreenstein { g: 0.3 },
         glow: None,
+    };
+    let look = Look {
+        camera,
+        media: vec![medium],
         lights: vec![Light::Sun(sun)],
         sky: Sky::Constant([0.2, 0.3, 0.4]),
     };

@@ -14,12 +14,14 @@ use glam::{DAffine3, DVec3, IVec3};
 use nuage_volume::brick;
 use nuage_volume::channel::{Channel, IndexBox};
 use nuage_volume::codec::Codec;
+use nuage_volume::codec::block::BlockFormat;
 use nuage_volume::format::Asset;
 use nuage_volume::format::contents::{ChannelInfo, FrameGrid};
 use nuage_volume::packed::build::{EntryScale, Packer};
 use nuage_volume::packed::{Content, Entry, Node, RootCell, TreeRef, Trees, mask};
 use nuage_volume::space::{BRICK_VOXELS, NODE4_SLOTS, NODE5_SLOTS};
 
+use crate::blocks;
 use crate::error::GpuError;
 use crate::params::{Field, Place};
 use crate::shader::{HEADER_WORDS, codec_bit};
@@ -29,6 +31,9 @@ use crate::shader::{HEADER_WORDS, codec_bit};
 pub enum Bricks {
     /// As they are stored: the least memory.
     AsStored,
+    /// As they are stored, but for those of texture blocks, which stand in 3D textures that the device decodes as it reads
+    /// them: as little memory, and less work. [`crate::device::Gpu::smallest_bricks`] says whether a device does.
+    Textures,
     /// As floats, 2 KiB each: the least work for each sample, and the same values.
     Decoded,
 }
@@ -76,12 +81,40 @@ pub struct Arrays {
     trees: Trees,
     words: Vec<u32>,
     shapes: Vec<u32>,
+    /// What goes to textures, by [`blocks::FORMATS`], where bricks of blocks have a number in place of them.
+    blocks: [Vec<u32>; 3],
+    has_textures: bool,
+    /// Whether only room is asked for: then the words of bricks are zeros, and their pages need not be loaded.
+    is_room: bool,
     /// Frame by frame, as many as there are channels; those that are nowhere are `None`.
     places: Vec<Option<Place>>,
     largest: Vec<f32>,
     channels: usize,
     codecs: u32,
     origin: DVec3,
+}
+
+/// How much a volume has to hold.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(crate) struct Room {
+    pub(crate) tree_words: usize,
+    pub(crate) fields: usize,
+    /// With those of shapes.
+    pub(crate) brick_words: usize,
+    /// Bricks in textures, by [`blocks::FORMATS`].
+    pub(crate) blocks: [usize; 3],
+}
+
+impl Room {
+    /// Room for either.
+    pub(crate) fn max(self, other: Room) -> Room {
+        Room {
+            tree_words: self.tree_words.max(other.tree_words),
+            fields: self.fields.max(other.fields),
+            brick_words: self.brick_words.max(other.brick_words),
+            blocks: std::array::from_fn(|i| self.blocks[i].max(other.blocks[i])),
+        }
+    }
 }
 
 /// Of which kind a node is.
@@ -158,18 +191,36 @@ impl Arrays {
         frames: Range<usize>,
         form: Bricks,
     ) -> Result<Arrays, GpuError> {
+        Arrays::default().with(asset, wanted, frames, form)
+    }
+
+    /// As [`Arrays::of_asset`], with zeros in place of the words of bricks, whose pages need not be loaded.
+    pub(crate) fn room_of(
+        asset: &Asset,
+        wanted: &[Wanted],
+        frame: usize,
+        form: Bricks,
+    ) -> Result<Arrays, GpuError> {
+        Arrays { is_room: true, ..Arrays::default() }.with(asset, wanted, frame..frame + 1, form)
+    }
+
+    fn with(
+        self,
+        asset: &Asset,
+        wanted: &[Wanted],
+        frames: Range<usize>,
+        form: Bricks,
+    ) -> Result<Arrays, GpuError> {
         let contents = asset.contents();
         let frames =
             contents.frames.get(frames.clone()).filter(|frames| !frames.is_empty()).ok_or_else(|| {
                 let count = contents.frames.len();
                 GpuError::Misuse(format!("frames {} to {} of {count}", frames.start, frames.end))
             })?;
-        let mut arrays =
-            Arrays { channels: wanted.len(), largest: vec![0.0; wanted.len()], ..Arrays::default() };
-        if form == Bricks::AsStored {
-            arrays.shapes = asset.store().shape_words().to_vec();
-            arrays.codecs =
-                asset.store().shape_codecs().iter().fold(0, |bits, codec| bits | codec_bit(*codec));
+        let mut arrays = Arrays { channels: wanted.len(), largest: vec![0.0; wanted.len()], ..self };
+        arrays.has_textures = form == Bricks::Textures;
+        if form != Bricks::Decoded {
+            arrays.take_shapes(asset);
         }
         let mut gathered = Gathered::default();
         for frame in frames {
@@ -211,6 +262,50 @@ impl Arrays {
         Arrays { words, shapes, places, largest, channels: 1, codecs: u32::MAX, ..Arrays::default() }
     }
 
+    /// Takes all shapes. Each stays where it is, so that bricks find it; what goes to textures leaves a gap.
+    fn take_shapes(&mut self, asset: &Asset) {
+        let store = asset.store();
+        self.shapes = store.shape_words().to_vec();
+        let mut at = 0;
+        for codec in store.shape_codecs() {
+            let end = at + codec.word_count();
+            if let Some(words) = store.shape_words().get(at..end) {
+                let taken = self.taken(*codec, words);
+                self.shapes[at..at + taken.len()].copy_from_slice(&taken);
+            }
+            self.codecs |= codec_bit(*codec);
+            at = end;
+        }
+    }
+
+    /// The words of a brick as they stand among others: of blocks that go to a texture, the line and their number there.
+    fn taken(&mut self, codec: Codec, words: &[u32]) -> Vec<u32> {
+        match (codec, words) {
+            (Codec::Block { format, .. }, [line, of_blocks @ ..]) if self.has_textures => {
+                let blocks = &mut self.blocks[blocks::number_of(format)];
+                let number = blocks.len() / blocks::brick_words(format);
+                blocks.extend_from_slice(of_blocks);
+                vec![*line, number as u32]
+            }
+            _ => words.to_vec(),
+        }
+    }
+
+    /// Moves bricks and shapes at these offsets to textures, for tests of their decoders.
+    #[cfg(test)]
+    pub(crate) fn move_to_textures(&mut self, bricks: &[(Codec, u32)], shapes: &[(Codec, u32)]) {
+        self.has_textures = true;
+        let (mut words, mut shape_words) = (self.words.clone(), self.shapes.clone());
+        for (all, places) in [(&mut words, bricks), (&mut shape_words, shapes)] {
+            for (codec, at) in places {
+                let words = &mut all[*at as usize..][..codec.word_count()];
+                let taken = self.taken(*codec, words);
+                words[..taken.len()].copy_from_slice(&taken);
+            }
+        }
+        (self.words, self.shapes) = (words, shape_words);
+    }
+
     /// Takes the finest tree of a grid.
     fn gather(
         &mut self,
@@ -233,7 +328,10 @@ impl Arrays {
             let entry = self.node(asset, channel, cell.entry, Kind::Node5, form, gathered)?;
             self.trees.cells.push(RootCell { entry, ..*cell });
         }
-        Ok(Some(place_of(info, tree, world_from_source, offset, [min, max], first_cell, meaning)))
+        // No sum of what a file says may overflow.
+        let inside = |p: [i32; 3]| IVec3::from_array(p).checked_sub(offset).ok_or_else(damaged);
+        let active_box = IndexBox { min: inside(min)?, max: inside(max)? };
+        Ok(Some(place_of(info, tree, world_from_source, offset, active_box, first_cell, meaning)))
     }
 
     /// An entry of a root or of a `Node5`, which leads to a node of the given kind, with all below it.
@@ -291,7 +389,7 @@ impl Arrays {
         let Some(Content::Brick { codec, offset }) = entry.content() else { return Ok(entry) };
         // Words mean the same in all channels, values do not.
         let (key, kept) = match form {
-            Bricks::AsStored => ((0, offset), codec),
+            Bricks::AsStored | Bricks::Textures => ((0, offset), codec),
             Bricks::Decoded => ((channel, offset), Codec::F32),
         };
         let payload = match gathered.bricks.get(&key) {
@@ -301,10 +399,18 @@ impl Arrays {
                 let at = at - BRICK_VOXELS as u32;
                 // Decoding is also what finds a damaged brick before a shader meets it.
                 let mut values = [0.0; BRICK_VOXELS];
-                asset.decode(channel, codec, offset, &mut values)?;
+                if !self.is_room {
+                    asset.decode(channel, codec, offset, &mut values)?;
+                }
                 match form {
                     Bricks::Decoded => self.words.extend(values.iter().map(|value| value.to_bits())),
-                    Bricks::AsStored => self.words.extend_from_slice(stored_words(asset, codec, offset)?),
+                    Bricks::AsStored | Bricks::Textures => {
+                        let words = match self.is_room {
+                            true => self.taken(codec, &vec![0; codec.word_count()]),
+                            false => self.taken(codec, stored_words(asset, codec, offset)?),
+                        };
+                        self.words.extend(words);
+                    }
                 }
                 self.codecs |= codec_bit(kept);
                 gathered.bricks.insert(key, at);
@@ -348,6 +454,24 @@ impl Arrays {
         self.origin = if middle.is_finite() { middle } else { DVec3::ZERO };
     }
 
+    /// Takes other frames for what is to be the same for all: their origin, their codecs, and their largest values.
+    pub(crate) fn agree_with(&mut self, other: &Arrays) {
+        self.origin = other.origin;
+        self.codecs |= other.codecs;
+        for (largest, other) in self.largest.iter_mut().zip(&other.largest) {
+            *largest = largest.max(*other);
+        }
+    }
+
+    /// Keeps of further frames where they are and what [`Arrays::agree_with`] takes of them, and not their words.
+    pub(crate) fn append_places(&mut self, other: &Arrays) {
+        self.places.extend(&other.places);
+        self.channels = other.channels;
+        self.largest.resize(other.largest.len(), 0.0);
+        self.agree_with(other);
+        self.settle();
+    }
+
     /// How many channels each frame has.
     pub fn channels(&self) -> usize {
         self.channels
@@ -355,12 +479,19 @@ impl Arrays {
 
     /// How many frames there are.
     pub fn frames(&self) -> usize {
-        self.places.len().checked_div(self.channels).unwrap_or(0)
+        // Without channels, nothing is in one frame.
+        self.places.len().checked_div(self.channels).unwrap_or(1)
     }
 
     /// The bytes of trees, and of bricks and shapes.
     pub fn size_bytes(&self) -> [usize; 2] {
-        [self.trees.size_bytes(), size_of::<u32>() * (self.words.len() + self.shapes.len())]
+        let of_blocks: usize = self.blocks.iter().map(Vec::len).sum();
+        [self.trees.size_bytes(), size_of::<u32>() * (self.words.len() + self.shapes.len() + of_blocks)]
+    }
+
+    /// The words of what goes to textures, by [`blocks::FORMATS`]; `None` if nothing does.
+    pub(crate) fn blocks(&self) -> Option<&[Vec<u32>; 3]> {
+        self.has_textures.then_some(&self.blocks)
     }
 
     pub(crate) fn codecs(&self) -> u32 {
@@ -371,14 +502,26 @@ impl Arrays {
         self.origin
     }
 
-    /// Where a channel is in a frame.
-    pub(crate) fn place(&self, frame: usize, channel: usize) -> Option<&Place> {
-        self.places.get(frame * self.channels + channel)?.as_ref()
+    /// Where each channel is, frame by frame.
+    pub(crate) fn places(&self) -> &[Option<Place>] {
+        &self.places
     }
 
     /// The largest value of a channel in all frames.
     pub(crate) fn largest(&self, channel: usize) -> f32 {
         self.largest.get(channel).copied().unwrap_or(0.0)
+    }
+
+    /// The room that all this takes.
+    pub(crate) fn room(&self) -> Room {
+        let bricks = |(format, words): (&BlockFormat, &Vec<u32>)| words.len() / blocks::brick_words(*format);
+        let mut of_formats = blocks::FORMATS.iter().zip(&self.blocks).map(bricks);
+        Room {
+            tree_words: HEADER_WORDS + self.trees.size_bytes() / size_of::<u32>(),
+            fields: self.places.len().max(1),
+            brick_words: self.words.len() + self.shapes.len(),
+            blocks: std::array::from_fn(|_| of_formats.next().unwrap_or(0)),
+        }
     }
 
     /// All fields, frame by frame. One at least, since no buffer is empty.
@@ -426,13 +569,13 @@ fn place_of(
     tree: &TreeRef,
     world_from_source: DAffine3,
     offset: IVec3,
-    [min, max]: [[i32; 3]; 2],
+    active_box: IndexBox,
     first_cell: u32,
     meaning: Meaning,
 ) -> Place {
     Place {
         world_from_index: world_from_source * DAffine3::from_translation(offset.as_dvec3()),
-        active_box: IndexBox { min: IVec3::from_array(min) - offset, max: IVec3::from_array(max) - offset },
+        active_box,
         index_offset: offset,
         cells: [first_cell, tree.cell_count],
         brick_unit: info.unit,

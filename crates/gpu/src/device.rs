@@ -2,8 +2,11 @@
 //!
 //! What does not live here: buffers of volumes ([`crate::upload`]) and pipelines ([`crate::renderer`]).
 
-use std::sync::{Arc, Mutex, PoisonError};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
+use crate::arrays::Bricks;
+use crate::blocks;
 use crate::error::GpuError;
 
 /// Which device to use.
@@ -22,6 +25,8 @@ pub struct Gpu {
     queue: wgpu::Queue,
     name: String,
     fault: Arc<Mutex<Option<GpuError>>>,
+    /// Whether textures of blocks are read right, once that was tried.
+    reads_blocks: Arc<OnceLock<bool>>,
 }
 
 /// The names of all devices, the best first.
@@ -74,7 +79,7 @@ impl Gpu {
         };
         let descriptor = wgpu::DeviceDescriptor {
             label: Some("nuage"),
-            required_features: adapter.features() & wgpu::Features::TIMESTAMP_QUERY,
+            required_features: adapter.features() & (wgpu::Features::TIMESTAMP_QUERY | blocks::NEEDED),
             required_limits,
             ..Default::default()
         };
@@ -83,19 +88,15 @@ impl Gpu {
         let gpu = Gpu::from_host(device, queue, name_of(adapter));
         // A device of our own tells us of its faults; by default they would end the program.
         let fault = Arc::clone(&gpu.fault);
-        gpu.device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| keep(&fault, error.to_string())));
+        gpu.device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| keep(&fault, fault_of(&error))));
         let fault = Arc::clone(&gpu.fault);
-        gpu.device.set_device_lost_callback(move |reason, message| {
-            if reason != wgpu::DeviceLostReason::Destroyed {
-                keep(&fault, format!("the device is lost: {message}"));
-            }
-        });
+        gpu.device.set_device_lost_callback(move |_, _| keep(&fault, GpuError::Lost));
         Ok(gpu)
     }
 
     /// A device that somebody else opened and goes on using. Its handlers of faults stay as they are.
     pub fn from_host(device: wgpu::Device, queue: wgpu::Queue, name: String) -> Gpu {
-        Gpu { device, queue, name, fault: Arc::default() }
+        Gpu { device, queue, name, fault: Arc::default(), reads_blocks: Arc::default() }
     }
 
     /// The name of the device.
@@ -113,12 +114,39 @@ impl Gpu {
         &self.queue
     }
 
+    /// How bricks take the least memory on this device: [`Bricks::Textures`] if it reads such textures right, which is tried
+    /// once, else [`Bricks::AsStored`].
+    ///
+    /// # Errors
+    /// If the device fails.
+    pub fn smallest_bricks(&self) -> Result<Bricks, GpuError> {
+        let reads = match self.reads_blocks.get() {
+            Some(known) => *known,
+            None => {
+                let found = blocks::are_read(self)?;
+                *self.reads_blocks.get_or_init(|| found)
+            }
+        };
+        Ok(if reads { Bricks::Textures } else { Bricks::AsStored })
+    }
+
     /// Does something with the device, whose complaints become errors.
     ///
     /// # Errors
     /// If the device is lost, runs out of memory, or refuses something.
     pub(crate) fn guarded<T>(&self, run: impl FnOnce() -> T) -> Result<T, GpuError> {
         self.health()?;
+        let (result, complaint) = self.heard(run);
+        match complaint {
+            // What is made of a lost device is refused later, for no reason that helps.
+            Some(wgpu::Error::Validation { .. }) if self.is_lost() => Err(GpuError::Lost),
+            Some(error) => Err(fault_of(&error)),
+            None => self.health().map(|()| result),
+        }
+    }
+
+    /// Does something with the device, and hears what it complains of.
+    fn heard<T>(&self, run: impl FnOnce() -> T) -> (T, Option<wgpu::Error>) {
         let filters =
             [wgpu::ErrorFilter::OutOfMemory, wgpu::ErrorFilter::Internal, wgpu::ErrorFilter::Validation];
         let scopes = filters.map(|filter| self.device.push_error_scope(filter));
@@ -128,10 +156,23 @@ impl Gpu {
         for scope in scopes.into_iter().rev() {
             found = pollster::block_on(scope.pop()).or(found);
         }
-        match found {
-            Some(error) => Err(GpuError::Device(error.to_string())),
-            None => self.health().map(|()| result),
-        }
+        (result, found)
+    }
+
+    /// Whether the device is lost. Only who opened it may be told so by itself; what it then makes is refused without a
+    /// word, and so is found out by using it.
+    fn is_lost(&self) -> bool {
+        let descriptor = wgpu::BufferDescriptor {
+            label: Some("nuage probe"),
+            size: wgpu::COPY_BUFFER_ALIGNMENT,
+            usage: wgpu::BufferUsages::COPY_DST,
+            mapped_at_creation: false,
+        };
+        let probe = || {
+            let buffer = self.device.create_buffer(&descriptor);
+            self.queue.write_buffer(&buffer, 0, &[0; wgpu::COPY_BUFFER_ALIGNMENT as usize]);
+        };
+        matches!(self.heard(probe).1, Some(wgpu::Error::Validation { .. }))
     }
 
     /// Whether the device still works.
@@ -145,11 +186,14 @@ impl Gpu {
     /// Waits until the device has done all that was submitted.
     ///
     /// # Errors
-    /// If it is lost.
+    /// If it is lost, or complained of something.
     pub fn wait(&self) -> Result<(), GpuError> {
-        let waited = self.device.poll(wgpu::PollType::wait_indefinitely());
+        // wgpu panics where a wait is what finds the device lost.
+        let poll = AssertUnwindSafe(|| self.device.poll(wgpu::PollType::wait_indefinitely()));
+        let waited = catch_unwind(poll).map_err(|_| GpuError::Lost)?;
         waited.map_err(|error| GpuError::Device(error.to_string()))?;
-        self.health()
+        self.health()?;
+        if self.is_lost() { Err(GpuError::Lost) } else { Ok(()) }
     }
 
     /// A buffer of these bytes.
@@ -196,9 +240,11 @@ impl Gpu {
         })?;
         let mapped: Arc<Mutex<Option<Result<(), wgpu::BufferAsyncError>>>> = Arc::default();
         let result = Arc::clone(&mapped);
-        staging.slice(..).map_async(wgpu::MapMode::Read, move |outcome| {
-            *result.lock().unwrap_or_else(PoisonError::into_inner) = Some(outcome);
-        });
+        self.guarded(|| {
+            staging.slice(..).map_async(wgpu::MapMode::Read, move |outcome| {
+                *result.lock().unwrap_or_else(PoisonError::into_inner) = Some(outcome);
+            });
+        })?;
         self.wait()?;
         let outcome = mapped.lock().unwrap_or_else(PoisonError::into_inner).take();
         if !matches!(outcome, Some(Ok(()))) {
@@ -211,6 +257,41 @@ impl Gpu {
 }
 
 /// Keeps the first fault.
-fn keep(fault: &Mutex<Option<GpuError>>, message: String) {
-    fault.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(GpuError::Device(message));
+fn keep(fault: &Mutex<Option<GpuError>>, error: GpuError) {
+    fault.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(error);
+}
+
+/// What a complaint comes to.
+fn fault_of(error: &wgpu::Error) -> GpuError {
+    match error {
+        wgpu::Error::OutOfMemory { .. } => GpuError::OutOfMemory,
+        error => GpuError::Device(error.to_string()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// More than any machine has, in one piece, which is refused before it is touched.
+    #[test]
+    fn no_memory_left_is_an_error_and_not_the_end() {
+        let Some(gpu) = crate::twins::gpu() else { return };
+        let side = gpu.device().limits().max_texture_dimension_3d;
+        let descriptor = wgpu::TextureDescriptor {
+            label: None,
+            size: wgpu::Extent3d { width: side, height: side, depth_or_array_layers: side },
+            mip_level_count: 1,
+            sample_count: 1,
+            dimension: wgpu::TextureDimension::D3,
+            format: wgpu::TextureFormat::Rgba32Float,
+            usage: wgpu::TextureUsages::TEXTURE_BINDING,
+            view_formats: &[],
+        };
+        let made = gpu.guarded(|| gpu.device().create_texture(&descriptor)).map(drop);
+        assert_eq!(made, Err(GpuError::OutOfMemory));
+        let bytes: Vec<u8> = (0..64).collect();
+        let buffer = gpu.buffer("small", &bytes, wgpu::BufferUsages::COPY_SRC).expect("a small buffer");
+        assert_eq!(gpu.read(&buffer), Ok(bytes));
+    }
 }

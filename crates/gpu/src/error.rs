@@ -13,7 +13,13 @@ pub enum GpuError {
         /// The names of those that are there.
         found: Vec<String>,
     },
-    /// The device or its driver failed: it is lost, out of memory, or refuses what it should take.
+    /// The device is lost: it was taken away, reset, or destroyed. Nothing that it held is left.
+    #[error("the GPU is lost: open it again, and give it anew what it held")]
+    Lost,
+    /// The device has no memory left.
+    #[error("the GPU has no memory left: take fewer frames or smaller pictures, or end what else uses it")]
+    OutOfMemory,
+    /// The device or its driver failed: it refuses what it should take.
     #[error("the GPU failed: {0}")]
     Device(String),
     /// The volume is damaged.

@@ -12,6 +12,7 @@
 #![forbid(unsafe_code)]
 
 pub mod arrays;
+mod blocks;
 mod blue_noise;
 mod budget;
 pub mod device;
@@ -23,8 +24,12 @@ pub mod picture;
 pub mod real_time;
 pub mod renderer;
 mod shader;
+mod sky;
+pub mod stream;
 mod timer;
 pub mod upload;
 
+#[cfg(test)]
+mod hostile;
 #[cfg(test)]
 mod twins;

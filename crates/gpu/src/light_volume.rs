@@ -12,6 +12,11 @@ use crate::params::{Params, Place};
 /// Nodes along each side: seven megabytes in all.
 pub(crate) const NODES: u32 = 96;
 
+/// The step of the walks that fill it, in voxels, where shadow rays take steps, or none at all.
+pub(crate) fn step_voxels(shadow_step_voxels: f32) -> f32 {
+    if shadow_step_voxels > 0.0 { shadow_step_voxels } else { 1.0 }
+}
+
 /// Lays the lattice around a field. `None` if numbers cannot hold it.
 pub(crate) fn lay(params: &mut Params, place: &Place) -> Option<()> {
     let [x, y, z, _] = params.sun_direction;

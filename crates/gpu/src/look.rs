@@ -1,38 +1,62 @@
-//! How a volume is to look: what `nuage_render::scene` says of a scene with one grid, without the grid, which is on the
-//! device already.
+//! How volumes are to look: what `nuage_render::scene` says of a scene, without the grids, which are on the device
+//! already.
 
-use glam::{DMat4, DVec3, Vec3};
+use glam::{DAffine3, DMat4, DVec3, Vec3};
 use nuage_render::camera::Camera;
-use nuage_render::filter::Lookup;
+use nuage_render::color::Blackbody;
 use nuage_render::light::{Light, Sky};
 use nuage_render::march::Quality;
 use nuage_render::path::PathSettings;
-use nuage_render::scene::{Phase, Scene, Shape, Spectrum};
+use nuage_render::scene::{self, Phase, Scene, Shape, Spectrum};
 use nuage_render::views::{self, View};
+use nuage_volume::channel::Channel;
 
 use crate::error::GpuError;
-pub use crate::params::MAX_LIGHTS;
-use crate::params::{LightParams, Params, Place};
+use crate::params::{LightParams, MediumParams, Params, Place, SHAPE_BALL, SHAPE_BOX, SHAPE_GRID};
+pub use crate::params::{MAX_LIGHTS, MAX_MEDIA};
 use crate::real_time::RealTime;
+use crate::shader::SOLID_CHANNEL;
 use crate::upload::Volume;
 
-/// How a volume is to look.
+/// How volumes are to look.
 #[derive(Debug, Clone)]
 pub struct Look {
     /// The view.
     pub camera: Camera,
+    /// What is seen, [`MAX_MEDIA`] at most. Where they overlap, extinctions add up.
+    pub media: Vec<Medium>,
+    /// Lights, [`MAX_LIGHTS`] at most.
+    pub lights: Vec<Light>,
+    /// The light from everywhere.
+    pub sky: Sky,
+}
+
+/// A medium and where it is.
+#[derive(Debug, Clone)]
+pub struct Medium {
+    /// Where it is.
+    pub place: MediumPlace,
+    /// The number of the channel that shadow rays and rays of scattered light read in place of the densities.
+    pub coarse: Option<usize>,
     /// Extinction per density and world length, per colour.
     pub extinction: [f32; 3],
     /// The share of extinction that is scattering, per colour.
     pub albedo: [f32; 3],
     /// Where light goes that is scattered.
     pub phase: Phase,
-    /// What glows: the number of the channel, and how its values become light.
-    pub glow: Option<(usize, Spectrum)>,
-    /// Lights, [`MAX_LIGHTS`] at most.
-    pub lights: Vec<Light>,
-    /// The light from everywhere; not a picture.
-    pub sky: Sky,
+    /// What glows: the number of the channel, or the density itself if `None`, and how its values become light.
+    pub glow: Option<(Option<usize>, Spectrum)>,
+}
+
+/// Where a medium is, and its density there.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum MediumPlace {
+    /// The number of the channel that holds its densities.
+    Channel(usize),
+    /// A density of 1 in what this makes of the cube from 0 to 1.
+    Box(DAffine3),
+    /// A density of 1 in what this makes of the ball of radius 1 around the origin.
+    Ball(DAffine3),
 }
 
 /// What is computed.
@@ -71,31 +95,52 @@ pub enum Pass {
     },
 }
 
+/// The channels of a scene, each once: of each volume the densities, the coarser level, and what glows. To be uploaded in this
+/// order for [`Look::of_scene`].
+pub fn channels_of<'a>(scene: &Scene<'a>) -> Vec<&'a Channel> {
+    let mut channels: Vec<&Channel> = Vec::new();
+    for volume in &scene.volumes {
+        let glow = volume.emission.as_ref().and_then(|emission| emission.channel);
+        for channel in [volume.shape.channel(), volume.coarse, glow].into_iter().flatten() {
+            if !channels.iter().any(|known| std::ptr::eq(*known, channel)) {
+                channels.push(channel);
+            }
+        }
+    }
+    channels
+}
+
 impl Look {
-    /// The look of a scene of one grid, whose channel is the first one uploaded; what glows is the second one, unless it is
-    /// the same.
+    /// The look of a scene whose channels are numbered as [`channels_of`] lists them.
     ///
     /// # Errors
-    /// If the scene has something else.
+    /// If the scene has more volumes than there may be.
     pub fn of_scene(scene: &Scene<'_>) -> Result<Look, GpuError> {
-        let unsupported = |feature| GpuError::Unsupported { feature };
-        let [volume] = scene.volumes.as_slice() else {
-            return Err(unsupported("more than one volume, or none"));
+        if scene.volumes.len() > MAX_MEDIA {
+            return Err(GpuError::Unsupported { feature: "more than sixteen volumes" });
+        }
+        let channels = channels_of(scene);
+        let number = |channel: &Channel| channels.iter().position(|known| std::ptr::eq(*known, channel));
+        let medium = |volume: &scene::Volume<'_>| {
+            let place = match volume.shape {
+                // All channels of the scene are listed.
+                Shape::Grid(channel) => MediumPlace::Channel(number(channel).unwrap_or(0)),
+                Shape::Box { world_from_unit } => MediumPlace::Box(world_from_unit),
+                Shape::Ball { world_from_unit } => MediumPlace::Ball(world_from_unit),
+            };
+            let glow = volume.emission.as_ref();
+            Medium {
+                place,
+                coarse: volume.coarse.and_then(number),
+                extinction: volume.extinction,
+                albedo: volume.albedo,
+                phase: volume.phase,
+                glow: glow.map(|glow| (glow.channel.and_then(number), glow.spectrum.clone())),
+            }
         };
-        if !matches!(volume.shape, Shape::Grid(_)) {
-            return Err(unsupported("a homogeneous box or ball"));
-        }
-        if volume.coarse.is_some() {
-            return Err(unsupported("a coarser level for shadows and scattered light"));
-        }
-        let glow = volume.emission.as_ref();
-        let glow = glow.map(|emission| (usize::from(emission.channel.is_some()), emission.spectrum.clone()));
         Ok(Look {
             camera: scene.camera,
-            extinction: volume.extinction,
-            albedo: volume.albedo,
-            phase: volume.phase,
-            glow,
+            media: scene.volumes.iter().map(medium).collect(),
             lights: scene.lights.clone(),
             sky: scene.sky.clone(),
         })
@@ -103,8 +148,15 @@ impl Look {
 
     /// Whether extinction is the same for all colours.
     pub(crate) fn is_grey(&self) -> bool {
-        let [red, green, blue] = self.extinction;
-        red == green && green == blue
+        self.media.iter().all(|medium| medium.is_grey())
+    }
+
+    /// The relative radiance of black bodies, if any glows as one.
+    pub(crate) fn blackbody(&self) -> Option<&Blackbody> {
+        self.media.iter().find_map(|medium| match &medium.glow {
+            Some((_, Spectrum::Blackbody { table, .. })) => Some(table.as_ref()),
+            _ => None,
+        })
     }
 
     /// What a pass is told.
@@ -123,7 +175,6 @@ impl Look {
         let Camera { origin: eye, forward, right, up, half_width_tangent } = self.camera;
         let wide = |v: DVec3| v.as_vec3().extend(0.0).to_array();
         let colour = |colour: [f32; 3], last: f32| Vec3::from_array(colour).extend(last).to_array();
-        let strongest = self.extinction.into_iter().fold(0.0, f32::max);
         let mut params = Params {
             camera: wide(eye - origin),
             forward: wide(forward),
@@ -131,18 +182,14 @@ impl Look {
             up: wide(up * half_width_tangent),
             size: [width, height, frame as u32, 0],
             counts: [1, u32::MAX, 0, self.lights.len() as u32],
-            extinction: colour(self.extinction, strongest.max(f32::MIN_POSITIVE)),
-            albedo: colour(self.albedo, 0.0),
-            phase: self.phase.lobes(),
             tone: [1.0, 1.0, 1.0, 1.0],
             ..Params::default()
         };
-        match &self.glow {
-            Some((_, Spectrum::Linear { rgb })) => params.emission = colour(*rgb, -1.0),
-            Some((_, Spectrum::Blackbody { kelvin_per_unit, scale, .. })) => {
-                params.emission = [*scale, 0.0, 0.0, kelvin_per_unit.max(0.0)];
-            }
-            None => {}
+        for (slot, medium) in params.media.iter_mut().zip(&self.media) {
+            *slot = medium.params(origin, self.blackbody());
+        }
+        if let Some(table) = self.blackbody() {
+            params.blackbody.iter_mut().zip(table.table()).for_each(|(slot, row)| *slot = *row);
         }
         match &self.sky {
             Sky::Gradient { up, zenith, horizon, ground } => {
@@ -151,7 +198,15 @@ impl Look {
                 params.sky_horizon = colour(*horizon, 0.0);
                 params.sky_ground = colour(*ground, 0.0);
             }
-            even => {
+            Sky::Map(map) => {
+                let parts = map.parts();
+                let rows = parts.map_from_world.transpose();
+                let row = |row: Vec3| row.extend(0.0).to_array();
+                (params.map_x, params.map_y, params.map_z) =
+                    (row(rows.x_axis), row(rows.y_axis), row(rows.z_axis));
+                params.map_size = [parts.width, parts.height, 0, 0];
+            }
+            even @ Sky::Constant(_) => {
                 let radiance = even.radiance(Vec3::Y).extend(0.0).to_array();
                 (params.sky_zenith, params.sky_horizon, params.sky_ground) = (radiance, radiance, radiance);
             }
@@ -181,30 +236,18 @@ impl Look {
         if self.lights.len() > MAX_LIGHTS {
             return unsupported("more than sixteen lights");
         }
-        if matches!(self.sky, Sky::Map(_)) {
-            return unsupported("a sky that is a picture");
+        let channels = self.media.iter().flat_map(Medium::channels);
+        if let Some(missing) = { channels }.find(|channel| *channel >= volume.channels()) {
+            return Err(GpuError::Misuse(format!("channel {missing} of a look was not uploaded")));
         }
-        if self.glow.as_ref().is_some_and(|(channel, _)| *channel >= volume.channels()) {
-            return Err(GpuError::Misuse("the channel that glows was not uploaded".to_owned()));
+        if matches!(pass, Pass::Path { .. }) {
+            return Ok(());
         }
+        let [Medium { place: MediumPlace::Channel(_), .. }] = self.media.as_slice() else {
+            return unsupported("anything but one grid in views and in one scattering");
+        };
         let is_point_sun = |light: &Light| matches!(light, Light::Sun(sun) if sun.angle_degrees <= 0.0);
-        let is_trilinear = |lookup: &Lookup| *lookup == Lookup::Trilinear;
         match pass {
-            Pass::March(Quality { lookup, .. })
-            | Pass::RealTime { quality: Quality { lookup, .. }, .. }
-            | Pass::Shadow(Quality { lookup, .. })
-            | Pass::Path { settings: PathSettings { lookup, .. }, .. }
-                if !is_trilinear(lookup) =>
-            {
-                unsupported("a filter that is not trilinear")
-            }
-            Pass::March(Quality { shadow_step_voxels, .. })
-            | Pass::RealTime { quality: Quality { shadow_step_voxels, .. }, .. }
-            | Pass::Shadow(Quality { shadow_step_voxels, .. })
-                if *shadow_step_voxels <= 0.0 =>
-            {
-                unsupported("shadow rays without steps")
-            }
             Pass::March(_) | Pass::RealTime { .. } | Pass::Shadow(_) if !self.is_grey() => {
                 unsupported("an extinction with a colour in one scattering")
             }
@@ -220,13 +263,28 @@ impl Look {
         }
     }
 
+    /// The channel of the densities that all passes but those of paths show.
+    pub(crate) fn density_channel(&self) -> usize {
+        match self.media.first() {
+            Some(Medium { place: MediumPlace::Channel(channel), .. }) => *channel,
+            _ => 0,
+        }
+    }
+
+    /// The channel of the densities that shadow rays meet.
+    pub(crate) fn shadow_channel(&self) -> usize {
+        let coarse = self.media.first().and_then(|medium| medium.coarse);
+        coarse.unwrap_or_else(|| self.density_channel())
+    }
+
     fn view(&self, params: &mut Params, volume: &Volume, view: View, frame: usize) {
-        let corners = volume.place(frame).map_or([DVec3::ZERO; 8], Place::world_corners);
+        let channel = self.density_channel();
+        let corners = volume.place(frame, channel).map_or([DVec3::ZERO; 8], Place::world_corners);
         let [nearest, furthest] = views::distances(&corners, &self.camera);
-        params.view = [nearest as f32, furthest as f32, volume.largest(), 0.0];
+        params.view = [nearest as f32, furthest as f32, volume.largest(channel), 0.0];
         params.counts[2] = match view {
             View::Density { extinction } => {
-                params.extinction = [extinction; 4];
+                params.media[0].extinction = [extinction; 4];
                 0
             }
             View::Depth => 1,
@@ -243,14 +301,73 @@ impl Look {
         let Quality { step_voxels, shadow_step_voxels, shadow_growth, min_transmittance, .. } = quality;
         params.march = [step_voxels, shadow_step_voxels, shadow_growth, min_transmittance];
         let max_shadow_depth = -min_transmittance.clamp(f32::MIN_POSITIVE, 1.0).ln();
-        params.march_rays =
-            [quality.sun_rays as f32, quality.sky_rays as f32, max_shadow_depth, shadow_step_voxels];
+        params.march_rays = [quality.sun_rays as f32, quality.sky_rays as f32, max_shadow_depth, 0.0];
         params.counts[0] = quality.samples.max(1);
         params.marched = [params.size[0], params.size[1], 1, 0];
         if let Some(Light::Sun(sun)) = self.lights.first() {
             params.sun_direction = sun.direction_to.extend(0.0).to_array();
             params.sun_irradiance = Vec3::from_array(sun.irradiance).extend(0.0).to_array();
         }
+    }
+}
+
+impl Medium {
+    /// Whether extinction is the same for all colours.
+    fn is_grey(&self) -> bool {
+        let [red, green, blue] = self.extinction;
+        red == green && green == blue
+    }
+
+    /// The channels that it reads.
+    fn channels(&self) -> impl Iterator<Item = usize> {
+        let density = match self.place {
+            MediumPlace::Channel(channel) => Some(channel),
+            MediumPlace::Box(_) | MediumPlace::Ball(_) => None,
+        };
+        let glow = self.glow.as_ref().and_then(|(channel, _)| *channel);
+        [density, self.coarse, glow].into_iter().flatten()
+    }
+
+    /// The channel that glows, [`SOLID_CHANNEL`] for a solid that does itself.
+    pub(crate) fn glow_channel(&self) -> Option<u32> {
+        let (channel, _) = self.glow.as_ref()?;
+        Some(match (*channel, self.place) {
+            (Some(channel), _) | (None, MediumPlace::Channel(channel)) => channel as u32,
+            (None, _) => SOLID_CHANNEL,
+        })
+    }
+
+    /// As shaders have it, in a world that begins at `origin`, with the table of black bodies that they have.
+    fn params(&self, origin: DVec3, shared: Option<&Blackbody>) -> MediumParams {
+        let colour = |colour: [f32; 3], last: f32| Vec3::from_array(colour).extend(last).to_array();
+        let strongest = self.extinction.into_iter().fold(0.0, f32::max);
+        let mut params = MediumParams {
+            extinction: colour(self.extinction, strongest.max(f32::MIN_POSITIVE)),
+            albedo: colour(self.albedo, 0.0),
+            phase: self.phase.lobes(),
+            ..MediumParams::default()
+        };
+        let (shape, density) = match self.place {
+            MediumPlace::Channel(channel) => (SHAPE_GRID, channel as u32),
+            MediumPlace::Box(_) => (SHAPE_BOX, SOLID_CHANNEL),
+            MediumPlace::Ball(_) => (SHAPE_BALL, SOLID_CHANNEL),
+        };
+        let coarse = self.coarse.map_or(density, |channel| channel as u32);
+        params.kind = [shape, density, coarse, self.glow_channel().unwrap_or(u32::MAX)];
+        if let MediumPlace::Box(world_from_unit) | MediumPlace::Ball(world_from_unit) = self.place {
+            params.place_solid(world_from_unit, origin);
+        }
+        match &self.glow {
+            Some((_, Spectrum::Linear { rgb })) => params.emission = colour(*rgb, -1.0),
+            Some((_, Spectrum::Blackbody { kelvin_per_unit, scale, table })) => {
+                // Tables differ in the temperature at which their luminance is 1, and so by a factor.
+                let hottest = |table: &Blackbody| table.table().first().map_or(0.0, |row| row[3]);
+                let factor = shared.map_or(1.0, |shared| (hottest(table) - hottest(shared)).exp());
+                params.emission = [scale * factor, 0.0, 0.0, kelvin_per_unit.max(0.0)];
+            }
+            None => {}
+        }
+        params
     }
 }
 

@@ -1,16 +1,27 @@
-//! What crosses to the shaders, as plain bytes: twins of the structures in `shader/bindings.wgsl`, and how fields and
-//! lights become them.
+//! What crosses to the shaders, as plain bytes: twins of the structures in `shader/bindings.wgsl`, and how fields, solids
+//! and lights become them.
 //!
 //! What does not live here: words of trees and bricks ([`crate::arrays`]), and who sends all this ([`crate::renderer`]).
 
 use bytemuck::{Pod, Zeroable};
-use glam::{DAffine3, DVec3, IVec3, Vec3};
+use glam::{DAffine3, DVec3, IVec3, Vec3, Vec4};
+use nuage_render::color::Blackbody;
 use nuage_render::light::Light;
 use nuage_volume::channel::IndexBox;
 use nuage_volume::space::LOG2_BRICK;
 
 /// The most lights of a scene.
 pub const MAX_LIGHTS: usize = 16;
+/// The most volumes of a scene.
+pub const MAX_MEDIA: usize = 16;
+
+/// The temperatures of which the radiance of a black body is known.
+pub(crate) const BLACKBODY_ROWS: usize = Blackbody::STEPS + 1;
+
+/// What a medium is, as shaders know it.
+pub(crate) const SHAPE_GRID: u32 = 0;
+pub(crate) const SHAPE_BOX: u32 = 1;
+pub(crate) const SHAPE_BALL: u32 = 2;
 
 /// The kinds of lights, as shaders know them.
 pub(crate) const LIGHT_SUN: u32 = 0;
@@ -91,8 +102,9 @@ impl Place {
             bounds_min: place(min.as_dvec3() - base, self.bounds_unit),
             bounds_max: place(max.as_dvec3() + 1.0 - base, self.floor),
             base_brick: whole(base_brick, self.cells[0]),
-            box_first: whole(min >> LOG2_BRICK, self.cells[1]),
-            box_last: whole(max >> LOG2_BRICK, 0),
+            // The widest filter reaches one voxel further than others.
+            box_first: whole(min.saturating_sub(IVec3::ONE) >> LOG2_BRICK, self.cells[1]),
+            box_last: whole(max.saturating_add(IVec3::ONE) >> LOG2_BRICK, 0),
             active_min: whole(self.active_box.min, 0),
             active_max: whole(self.active_box.max, 0),
             value: [scale, bias, most, 0.0],
@@ -148,9 +160,41 @@ impl LightParams {
     }
 }
 
-/// What a pass is told.
+/// A medium: what it is made of, and where it is.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable)]
+pub(crate) struct MediumParams {
+    pub(crate) extinction: [f32; 4],
+    pub(crate) albedo: [f32; 4],
+    pub(crate) phase: [f32; 4],
+    pub(crate) emission: [f32; 4],
+    pub(crate) kind: [u32; 4],
+    pub(crate) unit_x: [f32; 4],
+    pub(crate) unit_y: [f32; 4],
+    pub(crate) unit_z: [f32; 4],
+}
+
+impl MediumParams {
+    /// Puts a solid where it is, in a world that begins at `origin`; nowhere if it has no volume.
+    pub(crate) fn place_solid(&mut self, world_from_unit: DAffine3, origin: DVec3) {
+        let unit_from_world = world_from_unit.inverse() * DAffine3::from_translation(origin);
+        if !world_from_unit.is_finite() || !unit_from_world.is_finite() {
+            // Far beside the unit cube and ball, wherever a ray goes.
+            (self.unit_x, self.unit_y, self.unit_z) = ([0.0, 0.0, 0.0, 8.0], [0.0; 4], [0.0; 4]);
+            return;
+        }
+        let axes = unit_from_world.matrix3.transpose();
+        let row = |axis: DVec3, last: f64| Vec4::from((axis.as_vec3(), last as f32)).to_array();
+        let last = unit_from_world.translation;
+        self.unit_x = row(axes.x_axis, last.x);
+        self.unit_y = row(axes.y_axis, last.y);
+        self.unit_z = row(axes.z_axis, last.z);
+    }
+}
+
+/// What a pass is told.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 pub(crate) struct Params {
     pub(crate) camera: [f32; 4],
     pub(crate) forward: [f32; 4],
@@ -158,10 +202,6 @@ pub(crate) struct Params {
     pub(crate) up: [f32; 4],
     pub(crate) size: [u32; 4],
     pub(crate) counts: [u32; 4],
-    pub(crate) extinction: [f32; 4],
-    pub(crate) albedo: [f32; 4],
-    pub(crate) phase: [f32; 4],
-    pub(crate) emission: [f32; 4],
     pub(crate) sky_up: [f32; 4],
     pub(crate) sky_zenith: [f32; 4],
     pub(crate) sky_horizon: [f32; 4],
@@ -189,7 +229,19 @@ pub(crate) struct Params {
     pub(crate) before_right: [f32; 4],
     pub(crate) before_up: [f32; 4],
     pub(crate) history: [f32; 4],
+    pub(crate) map_x: [f32; 4],
+    pub(crate) map_y: [f32; 4],
+    pub(crate) map_z: [f32; 4],
+    pub(crate) map_size: [u32; 4],
+    pub(crate) media: [MediumParams; MAX_MEDIA],
     pub(crate) lights: [LightParams; MAX_LIGHTS],
+    pub(crate) blackbody: [[f32; 4]; BLACKBODY_ROWS],
+}
+
+impl Default for Params {
+    fn default() -> Params {
+        Params::zeroed()
+    }
 }
 
 #[cfg(test)]
@@ -225,10 +277,13 @@ mod tests {
         );
         assert_layout!(LightParams, "Light", place colour aim);
         assert_layout!(
-            Params, "Params", camera forward right up size counts extinction albedo phase emission sky_up sky_zenith
-            sky_horizon sky_ground march march_rays sun_direction sun_irradiance view tone clip_x clip_y clip_z
-            clip_w marched light_first light_x light_y light_z light_u light_v light_w before_camera before_forward
-            before_right before_up history lights
+            MediumParams, "Medium", extinction albedo phase emission kind unit_x unit_y unit_z
+        );
+        assert_layout!(
+            Params, "Params", camera forward right up size counts sky_up sky_zenith sky_horizon sky_ground march
+            march_rays sun_direction sun_irradiance view tone clip_x clip_y clip_z clip_w marched light_first light_x
+            light_y light_z light_u light_v light_w before_camera before_forward before_right before_up history map_x
+            map_y map_z map_size media lights blackbody
         );
     }
 }

@@ -5,14 +5,13 @@
 use nuage_render::film::Image;
 use nuage_render::march::Quality;
 use nuage_render::path::PathSettings;
-use nuage_render::scene::{Scene, Shape};
+use nuage_render::scene::Scene;
 use nuage_render::views::View;
-use nuage_volume::channel::Channel;
 
 use crate::arrays::Arrays;
 use crate::device::Gpu;
 use crate::error::GpuError;
-use crate::look::{Look, Pass};
+use crate::look::{Look, Pass, channels_of};
 use crate::renderer::Renderer;
 use crate::upload::Volume;
 
@@ -32,7 +31,7 @@ pub enum Asked {
     },
 }
 
-/// Renders a scene of one grid. The picture's alpha is 1 − transmittance; nothing stands behind the medium yet.
+/// Renders a scene; all but paths show one of a single grid. The picture's alpha is 1 − transmittance; nothing stands behind the medium yet.
 ///
 /// `progress` is called with passes done and passes in all.
 ///
@@ -46,20 +45,7 @@ pub fn render(
     progress: &dyn Fn(u32, u32),
 ) -> Result<Image, GpuError> {
     let look = Look::of_scene(scene)?;
-    let channels: Vec<&Channel> = scene
-        .volumes
-        .iter()
-        .flat_map(|volume| {
-            let glow = volume.emission.as_ref().and_then(|emission| emission.channel);
-            let density = match volume.shape {
-                Shape::Grid(channel) => Some(channel),
-                Shape::Box { .. } | Shape::Ball { .. } => None,
-            };
-            [density, glow]
-        })
-        .flatten()
-        .collect();
-    let volume = Volume::new(gpu, &Arrays::of_channels(&channels)?)?;
+    let volume = Volume::new(gpu, &Arrays::of_channels(&channels_of(scene))?)?;
     let mut renderer = Renderer::new(gpu, size)?;
     let passes = match asked {
         Asked::Path { samples, .. } => (*samples).max(1),

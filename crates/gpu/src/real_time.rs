@@ -22,9 +22,9 @@ use crate::error::GpuError;
 use crate::light_volume;
 use crate::look::Look;
 use crate::params::{Params, Place};
-use crate::shader::Source;
+use crate::shader::{Features, Source};
 use crate::timer::Timer;
-use crate::upload::{Volume, bind, storage_entry};
+use crate::upload::{Content, Volume, bind, storage_entry};
 
 /// How a picture that follows others is made cheap.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -64,7 +64,7 @@ const COUNT_MOVED: f32 = 16.0;
 const COUNT_CHANGED: f32 = 2.0;
 
 /// What a filled light volume was filled from.
-type Filled = (wgpu::BindGroup, [[f32; 4]; 6], u32);
+type Filled = (Content, [[f32; 4]; 6], u32, Features);
 
 /// Buffers and textures of the stages, and what goes from one picture to the next.
 #[derive(Debug)]
@@ -78,8 +78,8 @@ pub(crate) struct Stages {
     before: wgpu::Buffer,
     kept: [wgpu::Texture; 2],
     filled: Option<Filled>,
-    /// What the picture before was told, and of which volume it was.
-    last: Option<(Params, wgpu::BindGroup)>,
+    /// What the picture before was told, of which volume it was, and where its world began.
+    last: Option<(Params, Content, DVec3)>,
     number: u32,
     budget: Budget,
     effort: Effort,
@@ -294,10 +294,11 @@ impl Stages {
             pixels,
             if self.measures.accumulate { self.number } else { 0 },
         ];
-        let corners = volume.place(frame).map_or([DVec3::ZERO; 8], Place::world_corners);
+        let corners = volume.place(frame, look.density_channel()).map_or([DVec3::ZERO; 8], Place::world_corners);
         let [nearest, furthest] = views::distances(&corners, &look.camera);
         params.view = [nearest as f32, furthest as f32, 0.0, 0.0];
-        let place = volume.place(frame).filter(|_| self.measures.light_volume && !look.lights.is_empty());
+        let is_wanted = self.measures.light_volume && !look.lights.is_empty();
+        let place = volume.place(frame, look.shadow_channel()).filter(|_| is_wanted);
         place.is_some_and(|place| light_volume::lay(params, place).is_some())
     }
 
@@ -311,20 +312,20 @@ impl Stages {
         &mut self,
         params: &mut Params,
         volume: &Volume,
-        has_light_volume: bool,
+        features: &Features,
     ) -> Vec<Source> {
         let mut stages = Vec::with_capacity(4);
-        if has_light_volume {
-            let Params { light_first, light_x, light_y, light_z, extinction, march_rays, .. } = *params;
+        if features.has_light_volume {
+            let Params { light_first, light_x, light_y, light_z, march_rays, .. } = *params;
             let lattice = [
                 light_first,
                 light_x,
                 light_y,
                 light_z,
-                extinction,
+                params.media[0].extinction,
                 [march_rays[2], march_rays[3], 0.0, 0.0],
             ];
-            let filled = (volume.bind_group().clone(), lattice, params.size[2]);
+            let filled = (volume.content(), lattice, params.size[2], *features);
             if self.filled.as_ref() != Some(&filled) {
                 stages.push(Source::LightVolume);
                 self.filled = Some(filled);
@@ -339,11 +340,13 @@ impl Stages {
             self.number = self.number.wrapping_add(1);
             params.marched[3] = self.number;
             let camera = |params: &Params| [params.camera, params.forward, params.right, params.up];
-            params.history = match &self.last {
+            // Nothing is found again in another world.
+            let last = self.last.take().filter(|(_, _, origin)| *origin == volume.origin());
+            params.history = match &last {
                 None => [0.0; 4],
-                Some((last, of_volume)) => {
+                Some((last, of_volume, _)) => {
                     let has_moved = camera(last) != camera(params);
-                    let has_changed = content(last) != content(params) || of_volume != volume.bind_group();
+                    let has_changed = content(last) != content(params) || *of_volume != volume.content();
                     let count = match (has_changed, has_moved) {
                         (true, _) => COUNT_CHANGED,
                         (false, true) => COUNT_MOVED,
@@ -353,9 +356,9 @@ impl Stages {
                     [count, f32::from(u8::from(is_clamped)), f32::from(u8::from(has_moved)), 0.0]
                 }
             };
-            let before = camera(self.last.as_ref().map_or(params, |(last, _)| last));
+            let before = camera(last.as_ref().map_or(params, |(last, ..)| last));
             [params.before_camera, params.before_forward, params.before_right, params.before_up] = before;
-            self.last = Some((*params, volume.bind_group().clone()));
+            self.last = Some((*params, volume.content(), volume.origin()));
         }
         stages
     }
@@ -383,12 +386,11 @@ impl Stages {
 
 /// What of the parameters changes what there is to see, whoever looks and however finely.
 fn content(params: &Params) -> Params {
-    let Params { extinction, albedo, phase, emission, sun_direction, sun_irradiance, .. } = *params;
-    let Params { sky_zenith, lights, size: [.., frame, _], .. } = *params;
+    let Params { media, blackbody, sun_direction, sun_irradiance, size: [.., frame, _], .. } = *params;
+    // Of skies there are even ones alone, of lights the sun.
+    let sky_zenith = params.sky_zenith;
     let size = [0, 0, frame, 0];
-    let seen =
-        Params { extinction, albedo, phase, emission, sun_direction, sun_irradiance, ..Params::default() };
-    Params { sky_zenith, lights, size, ..seen }
+    Params { media, blackbody, sun_direction, sun_irradiance, sky_zenith, size, ..Params::default() }
 }
 
 fn texture(

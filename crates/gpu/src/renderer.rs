@@ -4,18 +4,24 @@
 //! changing it allocates nothing.
 
 use std::collections::HashMap;
+use std::ops::Range;
+use std::sync::Arc;
 
 use glam::DMat4;
-use nuage_render::scene::Spectrum;
+use nuage_render::envmap::EnvironmentMap;
+use nuage_render::filter::Lookup;
+use nuage_render::light::Sky;
+use nuage_render::path::PathSettings;
 use nuage_render::views::View;
 
 use crate::device::Gpu;
 use crate::error::GpuError;
 use crate::light_volume;
-use crate::look::{Look, Pass, world_from_clip};
+use crate::look::{Look, Medium, MediumPlace, Pass, world_from_clip};
 use crate::params::Params;
 use crate::real_time::Stages;
-use crate::shader::{Features, Source, WORKGROUP_SIDE, tables};
+use crate::shader::{Features, Source, WORKGROUP_SIDE};
+use crate::sky::{sky_group, sky_layout};
 use crate::upload::{Volume, bind, buffer_entry, storage_entry};
 
 /// A host's depth buffer, in front of which the volume ends.
@@ -38,11 +44,16 @@ pub struct Renderer {
     groups: [(wgpu::BindGroupLayout, wgpu::BindGroup); 2],
     depth_layout: wgpu::BindGroupLayout,
     depth: Option<wgpu::BindGroup>,
+    sky_layout: wgpu::BindGroupLayout,
+    /// The picture of the sky, if there was one.
+    sky: Option<(Arc<EnvironmentMap>, wgpu::BindGroup)>,
     pipelines: HashMap<(Source, Features), wgpu::ComputePipeline>,
     targets: HashMap<wgpu::TextureFormat, wgpu::RenderPipeline>,
     /// What the next [`Renderer::record`] runs.
     prepared: Option<Prepared>,
     current: Params,
+    /// What of that is on the device.
+    written: Option<Params>,
     /// What pictures that follow each other need, once there is one.
     stages: Option<Stages>,
 }
@@ -109,10 +120,13 @@ impl Renderer {
             groups,
             depth_layout,
             depth: None,
+            sky_layout: sky_layout(gpu)?,
+            sky: None,
             pipelines: HashMap::new(),
             targets: HashMap::new(),
             prepared: None,
             current: Params::default(),
+            written: None,
             stages: None,
         })
     }
@@ -159,13 +173,10 @@ impl Renderer {
         let is_real_time = matches!(pass, Pass::RealTime { .. });
         if let Pass::RealTime { quality, measures } = &mut pass {
             let gpu = self.gpu.clone();
-            let wanted = quality.shadow_step_voxels;
+            light_step_voxels = light_volume::step_voxels(quality.shadow_step_voxels);
             *quality = self.stages()?.ask(&gpu, *quality, *measures)?;
-            light_step_voxels = wanted;
         }
         let mut params = look.params(volume, &pass, self.size, frame)?;
-        let (chunks, log2_chunk_words) = volume.chunks();
-        let is_lit = matches!(source, Source::March | Source::Path | Source::Shadow);
         let mut has_light_volume = false;
         match self.stages.as_mut() {
             Some(stages) if is_real_time => {
@@ -176,17 +187,8 @@ impl Renderer {
             Some(stages) => stages.forget(),
             None => {}
         }
-        let features = Features {
-            codecs: volume.codecs(),
-            chunks,
-            log2_chunk_words,
-            glow_channel: look.glow.as_ref().filter(|_| is_lit).map(|(channel, _)| *channel as u32),
-            is_grey: look.is_grey() || !is_lit,
-            has_depth: depth.is_some() && is_lit,
-            is_real_time,
-            has_light_volume,
-            encodes_srgb: false,
-        };
+        let features =
+            Features { has_light_volume, ..features(volume, look, &pass, source, depth.is_some()) };
         if let Some(depth) = depth {
             [params.clip_x, params.clip_y, params.clip_z, params.clip_w] =
                 world_from_clip(&depth.clip_from_world, volume.origin());
@@ -207,11 +209,7 @@ impl Renderer {
                 self.pipelines.insert((source, features), pipeline);
             }
         }
-        if let Some((_, Spectrum::Blackbody { table, .. })) = &look.glow {
-            let at = 4 * tables::BLACKBODY as u64;
-            let bytes = bytemuck::cast_slice(table.table());
-            self.gpu.guarded(|| self.gpu.queue().write_buffer(volume.tables(), at, bytes))?;
-        }
+        self.bind_sky(look)?;
         let goes_on = matches!(pass, Pass::Path { sample: 1.., .. } | Pass::RealTime { .. });
         let is_of_points = matches!(pass, Pass::Shadow(_)) && depth.is_none();
         let look = is_real_time.then(|| look.clone());
@@ -297,16 +295,33 @@ impl Renderer {
         if let (Some(look), Some(stages)) = (look, self.stages.as_ref()) {
             // A light volume lies elsewhere around another frame.
             stages.settle(&mut self.current, volume, look, frame);
-            return self.write_params();
         }
-        let at = (std::mem::offset_of!(Params, size) + 2 * size_of::<u32>()) as u64;
-        let bytes = (frame as u32).to_le_bytes();
-        self.gpu.guarded(|| self.gpu.queue().write_buffer(&self.params, at, &bytes))
+        self.write_params()
     }
 
-    fn write_params(&self) -> Result<(), GpuError> {
+    /// Writes of the parameters what is not on the device yet: all from the first change to the last.
+    fn write_params(&mut self) -> Result<(), GpuError> {
         let bytes = bytemuck::bytes_of(&self.current);
-        self.gpu.guarded(|| self.gpu.queue().write_buffer(&self.params, 0, bytes))
+        let range = match &self.written {
+            Some(written) => changed(bytes, bytemuck::bytes_of(written)),
+            None => 0..bytes.len(),
+        };
+        if range.is_empty() {
+            return Ok(());
+        }
+        let at = range.start as u64;
+        self.gpu.guarded(|| self.gpu.queue().write_buffer(&self.params, at, &bytes[range]))?;
+        self.written = Some(self.current);
+        Ok(())
+    }
+
+    /// Takes the picture of a look's sky to the device, if it is another one.
+    fn bind_sky(&mut self, look: &Look) -> Result<(), GpuError> {
+        let Sky::Map(map) = &look.sky else { return Ok(()) };
+        if self.sky.as_ref().is_none_or(|(bound, _)| !Arc::ptr_eq(bound, map)) {
+            self.sky = Some((map.clone(), sky_group(&self.gpu, &self.sky_layout, map)?));
+        }
+        Ok(())
     }
 
     fn pipeline(
@@ -326,11 +341,12 @@ impl Renderer {
             let has_volume = !matches!(source, Source::Upsample | Source::Accumulate);
             let has_depth = features.has_depth && source != Source::LightVolume;
             let own = self.stages.as_ref().filter(|_| features.is_real_time);
+            let sky = features.sky_map[0].then_some(&self.sky_layout);
             let layouts = [
                 has_volume.then_some(volume.layout()),
                 Some(pass_layout),
                 has_depth.then_some(&self.depth_layout),
-                own.and_then(|stages| stages.layout(source)),
+                own.and_then(|stages| stages.layout(source)).or(sky),
             ];
             let layout = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
                 label: Some(source.entry_point()),
@@ -362,7 +378,7 @@ impl Renderer {
         let real_time = self.stages.as_mut().filter(|_| features.is_real_time);
         let sources = match real_time {
             Some(stages) => {
-                let sources = stages.advance(&mut self.current, volume, features.has_light_volume);
+                let sources = stages.advance(&mut self.current, volume, &features);
                 self.write_params()?;
                 sources
             }
@@ -399,6 +415,9 @@ impl Renderer {
             }
             if let Some(stages) = stages {
                 pass.set_bind_group(3, stages.group(*source), &[]);
+            }
+            if let Some((_, sky)) = self.sky.as_ref().filter(|_| features.sky_map[0]) {
+                pass.set_bind_group(3, sky, &[]);
             }
             let size = match source {
                 Source::LightVolume => [light_volume::NODES; 2],
@@ -460,17 +479,7 @@ impl Renderer {
         let device = self.gpu.device();
         // Eight bits hold encoded colours; formats that say so encode by themselves, and those of floats hold light.
         let is_unorm = matches!(format, wgpu::TextureFormat::Rgba8Unorm | wgpu::TextureFormat::Bgra8Unorm);
-        let features = Features {
-            codecs: 0,
-            chunks: 0,
-            log2_chunk_words: 0,
-            glow_channel: None,
-            is_grey: true,
-            has_depth: false,
-            is_real_time: false,
-            has_light_volume: false,
-            encodes_srgb: is_unorm,
-        };
+        let features = Features { encodes_srgb: is_unorm, ..Features::BARE };
         let text = Source::Tone.text(&features);
         self.gpu.guarded(|| {
             let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
@@ -536,9 +545,73 @@ impl Renderer {
     }
 }
 
+/// What the shader of a pass must be able to do.
+fn features(volume: &Volume, look: &Look, pass: &Pass, source: Source, has_depth: bool) -> Features {
+    let (chunks, log2_chunk_words) = volume.chunks();
+    let is_lit = matches!(source, Source::March | Source::Path | Source::Shadow);
+    let (lookup, sky_rays, shadow_step_voxels) = match *pass {
+        Pass::March(quality) | Pass::RealTime { quality, .. } | Pass::Shadow(quality) => {
+            (quality.lookup, false, quality.shadow_step_voxels)
+        }
+        Pass::Path { settings: PathSettings { lookup, sky_rays, .. }, .. } => (lookup, sky_rays, 1.0),
+        _ => (Lookup::Trilinear, false, 1.0),
+    };
+    let is_solid = |medium: &Medium| !matches!(medium.place, MediumPlace::Channel(_));
+    let has_sky_map = matches!(&look.sky, Sky::Map(map) if !map.is_black());
+    Features {
+        codecs: volume.codecs(),
+        textures: volume.textures(),
+        chunks,
+        log2_chunk_words,
+        // Where nothing is, there is one medium of nothing.
+        media: look.media.len().max(1) as u32,
+        has_solids: look.media.iter().any(is_solid),
+        density_channels: [look.density_channel() as u32, look.shadow_channel() as u32],
+        glow_channel: look.media.iter().find_map(Medium::glow_channel).filter(|_| is_lit),
+        is_grey: look.is_grey() || !is_lit,
+        lookup,
+        has_exact_shadows: shadow_step_voxels <= 0.0,
+        sky_map: [has_sky_map && source == Source::Path, has_sky_map && sky_rays],
+        has_depth: has_depth && is_lit,
+        is_real_time: matches!(pass, Pass::RealTime { .. }),
+        has_light_volume: false,
+        encodes_srgb: false,
+    }
+}
+
+/// Where bytes differ from others of the same count, from the first change to the last, in whole vectors of four floats.
+fn changed(new: &[u8], old: &[u8]) -> Range<usize> {
+    const UNIT: usize = size_of::<[f32; 4]>();
+    let is_changed = |i: &usize| new.chunks(UNIT).nth(*i) != old.chunks(UNIT).nth(*i);
+    let units = 0..new.len().div_ceil(UNIT);
+    match (units.clone().find(is_changed), units.rev().find(is_changed)) {
+        (Some(first), Some(last)) => first * UNIT..new.len().min((last + 1) * UNIT),
+        _ => 0..0,
+    }
+}
+
 fn check_frame(volume: &Volume, frame: usize) -> Result<(), GpuError> {
     match frame < volume.frames() {
         true => Ok(()),
         false => Err(GpuError::Misuse(format!("frame {frame} of {}", volume.frames()))),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_changes_is_found() {
+        let old = [7; 80];
+        let with = |places: &[usize]| {
+            let mut new = old;
+            places.iter().for_each(|place| new[*place] = 8);
+            changed(&new, &old)
+        };
+        assert_eq!(with(&[]), 0..0);
+        assert_eq!(with(&[0]), 0..16);
+        assert_eq!(with(&[17, 50]), 16..64);
+        assert_eq!(with(&[79]), 64..80);
     }
 }

@@ -6,20 +6,27 @@
 use std::fmt::Write as _;
 
 use nuage_render::color::Blackbody;
-use nuage_render::{color, hash, march, math, path, phase, surface, traverse};
+use nuage_render::filter::Lookup;
+use nuage_render::{color, envmap, hash, march, math, path, phase, surface, traverse};
 use nuage_volume::brick::f32_from_finite_f16;
 use nuage_volume::codec::block::{BlockFormat, PackingAxis, bc7};
 use nuage_volume::codec::{self, Codec, bounds, sparse};
 use nuage_volume::packed::{Entry, RootCell};
 use nuage_volume::space::{LOG2_BRICK, LOG2_NODE4_BRICKS, LOG2_NODE5_BRICKS, NODE4_SLOTS, NODE5_SLOTS};
 
-use crate::params::{self, MAX_LIGHTS};
+use crate::blocks::FORMATS;
+use crate::params::{self, MAX_LIGHTS, MAX_MEDIA};
+use crate::upload::FIRST_TEXTURE;
 use crate::{blue_noise, light_volume, real_time};
 
 /// Pixels along each side of a workgroup.
 pub(crate) const WORKGROUP_SIDE: u32 = 8;
 /// The tag of an entry that is not there.
 const ABSENT_TAG: u32 = 254;
+/// The most random numbers of one path, and leaps of one ray over regions of many bricks: paths and volumes that ask for more
+/// would keep a device busy until its driver takes it for lost.
+const MAX_DRAWS: u32 = 1 << 20;
+const MAX_LEAPS: u32 = 1 << 16;
 /// The words in front of the arrays of trees that say where each begins.
 pub(crate) const HEADER_WORDS: usize = 8;
 
@@ -28,14 +35,28 @@ pub(crate) const HEADER_WORDS: usize = 8;
 pub(crate) struct Features {
     /// The kinds of codecs that occur, by [`CODEC_KINDS`].
     pub(crate) codecs: u32,
+    /// The formats of blocks that stand in textures, a bit each: then all blocks do.
+    pub(crate) textures: u32,
     /// How many buffers hold the bricks.
     pub(crate) chunks: u32,
     /// log2 of the words of such a buffer.
     pub(crate) log2_chunk_words: u32,
-    /// Whether a channel glows, and its place among the channels.
+    /// How many media there are.
+    pub(crate) media: u32,
+    /// Whether one of them is a box or a ball.
+    pub(crate) has_solids: bool,
+    /// The channel of the first medium's densities, and that which its shadow rays read.
+    pub(crate) density_channels: [u32; 2],
+    /// Whether something glows, and the channel that does in the first medium.
     pub(crate) glow_channel: Option<u32>,
     /// Whether extinction is the same for all colours.
     pub(crate) is_grey: bool,
+    /// How values between voxels are looked up.
+    pub(crate) lookup: Lookup,
+    /// Whether shadow rays of the marcher take no steps.
+    pub(crate) has_exact_shadows: bool,
+    /// Whether the sky is a picture, and whether each collision looks for it.
+    pub(crate) sky_map: [bool; 2],
     /// Whether rays end at a host's depth buffer.
     pub(crate) has_depth: bool,
     /// Whether pictures follow each other, with what `real_time.wgsl` does for them.
@@ -46,20 +67,69 @@ pub(crate) struct Features {
     pub(crate) encodes_srgb: bool,
 }
 
-#[cfg(test)]
 impl Features {
+    /// What is least of all.
+    pub(crate) const BARE: Features = Features {
+        codecs: 0,
+        textures: 0,
+        chunks: 1,
+        log2_chunk_words: 0,
+        media: 1,
+        has_solids: false,
+        density_channels: [0, 0],
+        glow_channel: None,
+        is_grey: true,
+        lookup: Lookup::Trilinear,
+        has_exact_shadows: false,
+        sky_map: [false, false],
+        has_depth: false,
+        is_real_time: false,
+        has_light_volume: false,
+        encodes_srgb: false,
+    };
+
     /// All there is.
+    #[cfg(test)]
     pub(crate) const ALL: Features = Features {
         codecs: u32::MAX,
+        textures: 0,
         chunks: 2,
         log2_chunk_words: 25,
+        media: 3,
+        has_solids: true,
+        density_channels: [0, 2],
         glow_channel: Some(1),
         is_grey: false,
+        lookup: Lookup::StochasticTrilinear,
+        has_exact_shadows: true,
+        sky_map: [true, true],
         has_depth: false,
         is_real_time: false,
         has_light_volume: false,
         encodes_srgb: true,
     };
+
+    /// Whether there is one grid and nothing else.
+    fn is_one_grid(&self) -> bool {
+        self.media == 1 && !self.has_solids
+    }
+}
+
+/// The channel of densities, or of what glows, of a medium that has none.
+pub(crate) const SOLID_CHANNEL: u32 = u32::MAX - 1;
+
+/// The filters, as shaders number them.
+const LOOKUPS: [(Lookup, &str); 5] = [
+    (Lookup::Nearest, "LOOKUP_NEAREST"),
+    (Lookup::Trilinear, "LOOKUP_TRILINEAR"),
+    (Lookup::Tricubic, "LOOKUP_TRICUBIC"),
+    (Lookup::StochasticTrilinear, "LOOKUP_STOCHASTIC_TRILINEAR"),
+    (Lookup::StochasticTricubic, "LOOKUP_STOCHASTIC_TRICUBIC"),
+];
+
+/// The number of a filter.
+fn lookup_number(lookup: Lookup) -> u32 {
+    LOOKUPS.iter().position(|(known, _)| *known == lookup).unwrap_or(0) as u32
 }
 
 /// The kinds of codecs of which decoders can be left out.
@@ -160,6 +230,7 @@ impl Source {
         }
         text += picture;
         text += &brick_words(features);
+        text += &block_texels(features);
         COMMON.iter().for_each(|part| text += part);
         let end = if features.has_depth { file!("depth_end") } else { file!("open_end") };
         let kind = if features.is_real_time { file!("real_time") } else { file!("still") };
@@ -174,17 +245,55 @@ impl Source {
             }",
             empty: "",
         });
+        let voxel_depth = hdda(&Body {
+            name: "add_voxels",
+            state: "f32",
+            layer: Layer::Voxel,
+            step: "if (is_active(field, voxel)) { *state += in_region(field, region, voxel) * (t1 - t0); }",
+            empty: "",
+        });
+        let sky_map = if features.sky_map[0] { file!("envmap") } else { file!("even_sky") };
+        let media = if features.is_one_grid() { file!("one_grid") } else { file!("media") };
         let own: &[&str] = match self {
-            Source::Views => &[file!("camera"), file!("cells"), file!("views"), &first_voxel],
-            Source::Surface => &[file!("camera"), file!("cells"), file!("surface")],
-            Source::March => &[file!("camera"), file!("emission"), end, kind, file!("march")],
-            Source::Shadow => {
-                &[file!("camera"), file!("emission"), end, file!("still"), file!("march"), file!("shadow")]
+            Source::Views => {
+                &[file!("camera"), file!("cells"), file!("depth"), file!("views"), &first_voxel, &voxel_depth]
             }
+            Source::Surface => &[file!("camera"), file!("cells"), file!("surface")],
+            Source::March => &[
+                file!("camera"),
+                file!("emission"),
+                end,
+                kind,
+                file!("cells"),
+                file!("depth"),
+                &voxel_depth,
+                file!("march"),
+            ],
+            Source::Shadow => &[
+                file!("camera"),
+                file!("emission"),
+                end,
+                file!("still"),
+                file!("cells"),
+                file!("depth"),
+                &voxel_depth,
+                file!("march"),
+                file!("shadow"),
+            ],
             Source::LightVolume => &[file!("camera"), file!("light_volume")],
             Source::Upsample => &[file!("camera"), end, file!("upsample")],
             Source::Accumulate => &[file!("camera"), end, file!("accumulate")],
-            Source::Path => &[file!("camera"), file!("emission"), end, file!("light"), file!("path")],
+            Source::Path => &[
+                file!("camera"),
+                file!("emission"),
+                end,
+                file!("light"),
+                sky_map,
+                file!("solid"),
+                file!("track"),
+                media,
+                file!("path"),
+            ],
             Source::Tone => &[],
             #[cfg(test)]
             Source::Twins => &[file!("twins")],
@@ -256,9 +365,41 @@ fn brick_words(features: &Features) -> String {
     text
 }
 
+/// Reads a texel of the texture of a format, and how wide it is.
+fn block_texels(features: &Features) -> String {
+    let there: Vec<usize> =
+        (0..FORMATS.len()).filter(|format| features.textures >> format & 1 == 1).collect();
+    let mut text = String::new();
+    for format in &there {
+        let binding = FIRST_TEXTURE + *format as u32;
+        let _ = writeln!(text, "@group(0) @binding({binding}) var blocks_{format}: texture_3d<f32>;");
+    }
+    let mut function = |head: &str, none: &str, read: &dyn Fn(usize) -> String| {
+        let _ = writeln!(text, "fn {head} {{\n    switch (format) {{");
+        for format in &there {
+            let _ = writeln!(text, "        case {format}u: {{ return {}; }}", read(*format));
+        }
+        let _ = writeln!(text, "        default: {{ return {none}; }}\n    }}\n}}");
+    };
+    function("block_texel(format: u32, at: vec3<u32>) -> vec4<f32>", "vec4<f32>(0.0)", &|format| {
+        format!("textureLoad(blocks_{format}, at, 0)")
+    });
+    function("blocks_width(format: u32) -> u32", "1u << LOG2_BRICK", &|format| {
+        format!("textureDimensions(blocks_{format}).x")
+    });
+    text
+}
+
+/// The shader that reads a texture of blocks to see whether a device does.
+pub(crate) fn probe() -> String {
+    let mut p = Prelude(String::new());
+    p.u("WORKGROUP_SIDE", WORKGROUP_SIDE);
+    p.0 + file!("probe")
+}
+
 /// Where tables stand in the buffer of tables.
 pub(crate) mod tables {
-    use super::{Blackbody, bc7};
+    use super::bc7;
 
     pub(crate) const BC7_MODES: usize = 0;
     pub(crate) const BC7_WEIGHTS: usize = BC7_MODES + 10 * bc7::MODES.len();
@@ -268,12 +409,10 @@ pub(crate) mod tables {
     pub(crate) const BC7_TWO_ANCHOR: usize = BC7_THREE_SUBSETS + 64;
     pub(crate) const BC7_THREE_SECOND_ANCHOR: usize = BC7_TWO_ANCHOR + 64;
     pub(crate) const BC7_THREE_THIRD_ANCHOR: usize = BC7_THREE_SECOND_ANCHOR + 64;
-    pub(crate) const BLACKBODY: usize = BC7_THREE_THIRD_ANCHOR + 64;
-    pub(crate) const WORDS: usize = BLACKBODY + 4 * (Blackbody::STEPS + 1);
 
-    /// All tables but that of black bodies, which belongs to a scene.
+    /// All tables.
     pub(crate) fn words() -> Vec<u32> {
-        let mut words = Vec::with_capacity(WORDS);
+        let mut words = Vec::with_capacity(BC7_THREE_THIRD_ANCHOR + 64);
         for mode in &bc7::MODES {
             words.extend([mode.subsets as u32, mode.partition, mode.rotation, mode.selection, mode.colour]);
             words.extend([mode.alpha, mode.endpoint_low, mode.shared_low, mode.index, mode.second_index]);
@@ -287,7 +426,6 @@ pub(crate) mod tables {
         for anchors in [bc7::TWO_ANCHOR, bc7::THREE_SECOND_ANCHOR, bc7::THREE_THIRD_ANCHOR] {
             words.extend(anchors.map(u32::from));
         }
-        words.resize(WORDS, 0);
         words
     }
 }
@@ -332,11 +470,13 @@ fn prelude(features: &Features) -> String {
     p.f("EXP_HIGHEST", math::EXP_HIGHEST);
     p.f("OPAQUE_DEPTH", math::OPAQUE_DEPTH);
     p.i("ROOT_HALF", math::ROOT_HALF);
+    p.f("TAN_SIXTEENTH", math::TAN_SIXTEENTH);
     let series = [
         ("EXP", &math::EXP_SERIES[..]),
         ("LN", &math::LN_SERIES),
         ("SIN", &math::SIN_SERIES),
         ("COS", &math::COS_SERIES),
+        ("ATAN", &math::ATAN_SERIES),
     ];
     for (name, terms) in series {
         terms.iter().enumerate().for_each(|(i, term)| p.f(&format!("{name}_SERIES_{i}"), *term));
@@ -360,6 +500,7 @@ fn prelude(features: &Features) -> String {
     p.f("COLDEST_KELVIN", Blackbody::COLDEST_KELVIN);
     p.f("HOTTEST_KELVIN", Blackbody::HOTTEST_KELVIN);
     p.f("BLACKBODY_STEPS", Blackbody::STEPS as f32);
+    p.u("BLACKBODY_ROWS", params::BLACKBODY_ROWS);
 
     p.u("LOG2_BRICK", LOG2_BRICK);
     p.u("LOG2_NODE4_BRICKS", LOG2_NODE4_BRICKS);
@@ -404,6 +545,7 @@ fn prelude(features: &Features) -> String {
         .iter()
         .enumerate()
         .for_each(|(i, name)| p.b(&format!("HAS_{name}"), features.codecs >> i & 1 == 1));
+    p.b("HAS_TEXTURES", features.textures != 0);
     p.u("BC7_MODES", tables::BC7_MODES);
     p.u("BC7_WEIGHTS", tables::BC7_WEIGHTS);
     p.u("BC7_TWO_SUBSETS", tables::BC7_TWO_SUBSETS);
@@ -411,8 +553,9 @@ fn prelude(features: &Features) -> String {
     p.u("BC7_TWO_ANCHOR", tables::BC7_TWO_ANCHOR);
     p.u("BC7_THREE_SECOND_ANCHOR", tables::BC7_THREE_SECOND_ANCHOR);
     p.u("BC7_THREE_THIRD_ANCHOR", tables::BC7_THREE_THIRD_ANCHOR);
-    p.u("BLACKBODY", tables::BLACKBODY);
 
+    p.u("MAX_DRAWS", MAX_DRAWS);
+    p.u("MAX_LEAPS", MAX_LEAPS);
     p.u("MAX_ROOT_LEAPS", traverse::MAX_ROOT_LEAPS);
     p.i("MAX_ROOT_LEAP", traverse::MAX_ROOT_LEAP as i32);
     p.u("MOST_REFINEMENTS", surface::MOST_REFINEMENTS);
@@ -433,7 +576,23 @@ fn prelude(features: &Features) -> String {
     p.u("LIGHT_SUN", params::LIGHT_SUN);
     p.u("LIGHT_SPOT", params::LIGHT_SPOT);
     p.u("LIGHT_SPHERE", params::LIGHT_SPHERE);
-    p.u("DENSITY_CHANNEL", 0u32);
+    p.b("HAS_EXACT_SHADOWS", features.has_exact_shadows);
+    p.u("SHAPE_GRID", params::SHAPE_GRID);
+    p.u("SHAPE_BALL", params::SHAPE_BALL);
+    p.u("SOLID_CHANNEL", SOLID_CHANNEL);
+    p.u("MAX_MEDIA", MAX_MEDIA);
+    p.u("MEDIA", features.media);
+    p.b("HAS_SOLIDS", features.has_solids);
+    p.f("ENVIRONMENT_PARTS", envmap::PARTS as f32);
+    p.b("HAS_SKY_RAYS", features.sky_map[1]);
+    LOOKUPS.iter().for_each(|(lookup, name)| p.u(name, lookup_number(*lookup)));
+    p.u("LOOKUP", lookup_number(features.lookup));
+    p.u("MEAN_LOOKUP", lookup_number(features.lookup.mean()));
+    let is_wide = features.lookup.mean() == Lookup::Tricubic;
+    p.b("IS_WIDE", is_wide);
+    p.f("REACH", f32::from(u8::from(is_wide)));
+    p.u("DENSITY_CHANNEL", features.density_channels[0]);
+    p.u("SHADOW_CHANNEL", features.density_channels[1]);
     p.u("GLOW_CHANNEL", features.glow_channel.unwrap_or(0));
     p.b("HAS_EMISSION", features.glow_channel.is_some());
     p.b("IS_GREY", features.is_grey);
@@ -480,10 +639,13 @@ mod tests {
             Source::Tone,
             Source::Twins,
         ];
-        let bare = Features { codecs: 0, chunks: 1, glow_channel: None, is_grey: true, ..Features::ALL };
-        let cut = Features { has_depth: true, chunks: 4, ..Features::ALL };
-        let real_time = Features { is_real_time: true, has_light_volume: true, ..cut };
-        for features in [Features::ALL, bare, cut, real_time] {
+        let tricubic = Features { lookup: Lookup::Tricubic, glow_channel: Some(0), ..Features::BARE };
+        validate(&probe());
+        let textures = Features { textures: 7, ..Features::ALL };
+        let depth = Features { has_depth: true, chunks: 4, textures: 4, ..Features::ALL };
+        let real_time = Features { is_real_time: true, has_light_volume: true, ..tricubic };
+        let cut = Features { has_depth: true, has_exact_shadows: true, ..real_time };
+        for features in [Features::ALL, Features::BARE, tricubic, textures, depth, real_time, cut] {
             for source in sources {
                 let text = source.text(&features);
                 validate(&text);
@@ -511,6 +673,7 @@ mod tests {
         assert_eq!(words[tables::BC7_WEIGHTS + 4], 0);
         assert_eq!(words[tables::BC7_WEIGHTS + 31], 64);
         assert_eq!(words[tables::BC7_TWO_SUBSETS], u32::from(bc7::TWO_SUBSETS[0]));
-        assert_eq!(words[tables::BLACKBODY - 1], u32::from(bc7::THREE_THIRD_ANCHOR[63]));
+        assert_eq!(words[tables::BC7_THREE_THIRD_ANCHOR + 63], u32::from(bc7::THREE_THIRD_ANCHOR[63]));
+        assert_eq!(words.len(), tables::BC7_THREE_THIRD_ANCHOR + 64);
     }
 }

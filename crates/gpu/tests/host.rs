@@ -17,7 +17,10 @@ use nuage_pipeline::pack::options::Options;
 use nuage_render::march::Quality;
 use nuage_vdb::AnyTree;
 use nuage_volume::build::TileSize;
+use nuage_volume::codec::Codec;
 use nuage_volume::format::Asset;
+use nuage_volume::format::contents::Contents;
+use nuage_volume::packed::{Entry, TreeRef, Trees};
 
 /// Frames of a packed volume, one after the other, without another upload.
 #[test]
@@ -39,11 +42,11 @@ fn frames_are_switched_by_a_number() {
     let mut renderer = common::renderer(&gpu);
     let mut look = Look::of_scene(&scenes[0]).expect("a look");
     let quality = Quality { step_voxels: 2.0, shadow_step_voxels: 4.0, sky_rays: 0, ..Quality::default() };
-    look.extinction = scenes[0].volumes[0].extinction;
+    look.media[0].extinction = scenes[0].volumes[0].extinction;
     let march = |frame: usize| {
         let mut scene = scenes[frame].clone();
         scene.camera = scenes[0].camera;
-        scene.volumes[0].extinction = look.extinction;
+        scene.volumes[0].extinction = look.media[0].extinction;
         nuage_render::picture::render(&scene, quality, SIZE[0], SIZE[1], &|_, _| ())
             .expect("a picture")
             .pixels
@@ -226,12 +229,20 @@ fn what_makes_no_sense_is_an_error() {
     let volume = uploaded(&gpu, &[&channel]);
     let scene = lit(&channel);
     let mut look = Look::of_scene(&scene).expect("a look");
-    look.extinction = [1.0, 2.0, 3.0];
+    look.media[0].extinction = [1.0, 2.0, 3.0];
     let mut renderer = common::renderer(&gpu);
     let prepared = renderer.prepare(&volume, &look, &Pass::March(Quality::default()), 0, None);
     assert!(matches!(prepared, Err(GpuError::Unsupported { .. })), "{prepared:?}");
     assert!(matches!(renderer.run(&volume), Err(GpuError::Misuse(_))), "nothing was prepared");
     assert!(matches!(renderer.prepare(&volume, &look, &Pass::Hits, 1, None), Err(GpuError::Misuse(_))));
+}
+
+/// Moves a pointer by some words, nodes or cells.
+type Damage<'a> = dyn Fn(&mut Contents, &mut Trees, u32) + 'a;
+
+/// The finest tree of the first grid.
+fn level(contents: &mut Contents) -> &mut TreeRef {
+    &mut contents.frames[0].grids[0].levels[0]
 }
 
 /// Pointers out of range are refused before anything of the asset reaches a device; pages that are absent when they are
@@ -240,16 +251,60 @@ fn what_makes_no_sense_is_an_error() {
 fn damaged_volumes_are_refused() {
     let asset = packed(&[vec![common::grid("density")]], &Options::default());
     let parts = || (asset.contents().clone(), asset.trees().clone(), asset.store().clone());
-    let (contents, mut trees, store) = parts();
-    trees.node5s[0].first_entry = u32::MAX;
-    assert!(Asset::from_parts(contents, trees, store).is_err());
-    let (contents, mut trees, store) = parts();
-    trees.entries.iter_mut().for_each(|entry| entry.payload |= 1 << 30);
-    assert!(Asset::from_parts(contents, trees, store).is_err());
+    let (contents, trees, store) = parts();
+    let is_tagged = |entry: &Entry, tag: u8| entry.kind as u8 == tag;
+    let brick = trees.entries.iter().position(|entry| !is_tagged(entry, 0) && !is_tagged(entry, Entry::NODE));
+    let node4 = trees.entries.iter().position(|entry| is_tagged(entry, Entry::NODE));
+    let (brick, node4) = (brick.expect("a brick"), node4.expect("a node"));
+    assert!(Asset::from_parts(contents, trees, store).is_ok());
+    // Each pointer that a shader follows, one beyond the last and far beyond.
+    let damage: [(&str, &Damage<'_>); 11] = [
+        ("the node of a root cell", &|_, trees, by| trees.cells[0].entry.payload += by),
+        ("the node of an entry", &|_, trees, by| trees.entries[node4].payload += by),
+        ("the mask of a Node5", &|_, trees, by| trees.node5s[0].mask += by),
+        ("the mask of a Node4", &|_, trees, by| trees.node4s[0].mask += by),
+        ("the entries of a Node5", &|_, trees, by| trees.node5s[0].first_entry += by.max(1 << 20)),
+        ("the entries of a Node4", &|_, trees, by| trees.node4s[0].first_entry += by.max(1 << 20)),
+        ("the words of a brick", &|_, trees, by| trees.entries[brick].payload += by),
+        ("the codec of a brick", &|_, trees, _| trees.entries[brick].kind ^= 1),
+        ("a brick in place of a node", &|_, trees, _| trees.entries[node4].kind ^= 0xff ^ 10),
+        ("the first cell of a tree", &|contents, _, by| level(contents).first_cell += by),
+        ("the cells of a tree", &|contents, _, by| level(contents).cell_count += by),
+    ];
+    for (what, damage) in damage {
+        for by in [1, 1 << 30] {
+            let (mut contents, mut trees, store) = parts();
+            damage(&mut contents, &mut trees, by);
+            let made = Asset::from_parts(contents, trees, store);
+            assert!(made.is_err(), "{what}, by {by}");
+        }
+    }
+    // A box whose sums overflow is met on the way to the device.
+    let (mut contents, trees, store) = parts();
+    let grid = &mut contents.frames[0].grids[0];
+    (grid.index_offset[0], grid.active_box) = (8, Some([[i32::MIN; 3], [i32::MAX; 3]]));
+    let wanted = [Wanted { name: "density".to_owned(), meaning: Meaning::Density }];
+    if let Ok(asset) = Asset::from_parts(contents, trees, store) {
+        assert!(Arrays::of_asset(&asset, &wanted, 0..1, Bricks::AsStored).is_err());
+    }
+    // A shared brick whose shape is not there is no page.
+    let shapes = packed(
+        &[vec![common::grid("density")]],
+        &Options { psnr: Some(25.0), max_error: None, shapes: 8, ..Options::default() },
+    );
+    let mut store = shapes.store().clone();
+    let shared = store.codecs().iter().position(|codec| *codec == Codec::Shared).expect("a shared brick");
+    let at = store.offset(shared);
+    let page = store.page_of(at).expect("its page");
+    let first = store.pages()[page].first_word;
+    for word in [1, 2] {
+        let mut words = store.pages()[page].words().expect("a page that is loaded").to_vec();
+        words[(at - first) as usize + word] += 1;
+        assert!(store.set_page(page, words).is_err(), "word {word} of a shared brick");
+    }
     let (contents, trees, mut store) = parts();
     store.drop_page(0);
     let without = Asset::from_parts(contents, trees, store).expect("all but its bricks");
-    let wanted = [Wanted { name: "density".to_owned(), meaning: Meaning::Density }];
     let arrays = Arrays::of_asset(&without, &wanted, 0..1, Bricks::AsStored);
     assert!(matches!(arrays, Err(GpuError::Malformed(_))), "{:?}", arrays.map(drop));
     assert!(matches!(Arrays::of_asset(&asset, &wanted, 3..4, Bricks::AsStored), Err(GpuError::Misuse(_))));

@@ -1,140 +1,30 @@
-//! The path tracer of the GPU held to that of the CPU: both are estimates, so blocks of pixels are compared in standard
-//! errors.
+//! Pictures of paths held to those of the CPU: the scenes of the oracle, and what else a scene may hold.
 
 #![allow(clippy::print_stdout, reason = "the measured errors are worth reading")]
 
 mod common;
 
-use common::{bent, channel_of, cloud, gpu, lit, uploaded};
-use glam::{IVec3, Vec3};
-use nuage_gpu::device::Gpu;
-use nuage_gpu::look::{Look, Pass};
-use nuage_gpu::renderer::Renderer;
-use nuage_gpu::upload::Volume as GpuVolume;
-use nuage_render::film::Film;
+use std::f32::consts::TAU;
+use std::sync::Arc;
+
+use common::paths::compare;
+use common::{bent, channel_of, cloud, gpu, grid, lit};
+use glam::{DAffine3, DQuat, DVec3, IVec3, Vec3};
+use nuage_render::camera::Camera;
+use nuage_render::color::Blackbody;
+use nuage_render::envmap::{self, EnvironmentMap};
+use nuage_render::filter::Lookup;
 use nuage_render::framing::WorldBox;
 use nuage_render::light::{Light, Sky, Spot, Sun};
+use nuage_render::lod::coarser_by;
 use nuage_render::path::PathSettings;
-use nuage_render::progressive::{Plan, Watch, trace};
-use nuage_render::scene::{Emission, Phase, Scene, Spectrum};
-use nuage_testkit::blocks::Estimate;
-
-const WIDTH: u32 = 48;
-const HEIGHT: u32 = 32;
-/// Paths for each pixel on the GPU come in so many batches, whose spread tells their standard error.
-const BATCHES: u32 = 8;
-
-/// Red, green, blue and opacity of all pixels on the GPU.
-fn of_gpu(
-    gpu: &Gpu,
-    volume: &GpuVolume,
-    look: &Look,
-    settings: PathSettings,
-    samples: u32,
-) -> [Vec<Estimate>; 4] {
-    let mut renderer = Renderer::new(gpu, [WIDTH, HEIGHT]).expect("a renderer");
-    let mut batches: Vec<Vec<[f32; 4]>> = Vec::new();
-    let mut before = vec![[0.0_f32; 4]; (WIDTH * HEIGHT) as usize];
-    for batch in 0..BATCHES {
-        for sample in batch * samples..(batch + 1) * samples {
-            renderer.prepare(volume, look, &Pass::Path { settings, sample }, 0, None).expect("a pass");
-            renderer.run(volume).expect("a run");
-        }
-        let count = ((batch + 1) * samples) as f32;
-        let sums: Vec<[f32; 4]> =
-            renderer.pixels().expect("pixels").iter().map(|p| p.map(|v| v * count)).collect();
-        let mean = |(now, before): (&[f32; 4], &[f32; 4])| {
-            std::array::from_fn(|i| (now[i] - before[i]) / samples as f32)
-        };
-        batches.push(sums.iter().zip(&before).map(mean).collect());
-        before = sums;
-    }
-    let count = f64::from(BATCHES);
-    std::array::from_fn(|channel| {
-        let estimate = |pixel: usize| {
-            let values = || batches.iter().map(|batch| f64::from(batch[pixel][channel]));
-            let mean = values().sum::<f64>() / count;
-            let variance = values().map(|value| (value - mean).powi(2)).sum::<f64>() / (count - 1.0) / count;
-            Estimate { mean, variance }
-        };
-        (0..(WIDTH * HEIGHT) as usize).map(estimate).collect()
-    })
-}
-
-fn of_cpu(scene: &Scene<'_>, settings: PathSettings, samples: u32) -> [Vec<Estimate>; 4] {
-    let mut film = Film::new(WIDTH, HEIGHT).expect("a film");
-    let plan = Plan { settings, samples, pass_samples: samples, seed: 5, ..Plan::default() };
-    trace(scene, &plan, &mut film, &mut Watch::default());
-    let all = film.map(|tally| {
-        let [red, green, blue] = tally.light();
-        ([red, green, blue, tally.alpha()], tally.standard_error())
-    });
-    std::array::from_fn(|channel| {
-        let estimate = |(mean, error): &([f32; 4], [f32; 4])| Estimate {
-            mean: mean[channel].into(),
-            variance: f64::from(error[channel]).powi(2),
-        };
-        all.iter().map(estimate).collect()
-    })
-}
-
-fn compare(name: &str, gpu: &Gpu, volume: &GpuVolume, scene: &Scene<'_>, settings: PathSettings) {
-    let look = Look::of_scene(scene).expect("a look");
-    let ours = of_gpu(gpu, volume, &look, settings, 8);
-    let theirs = of_cpu(scene, settings, 64);
-    for (channel, (ours, theirs)) in ["red", "green", "blue", "opacity"].iter().zip(ours.iter().zip(&theirs))
-    {
-        hold(&format!("{name}, {channel}"), ours, theirs);
-    }
-}
-
-/// Holds the mean to three standard errors, and of blocks of 8 × 8 pixels 99 %, or all but one, to three and all to five. What is known of a
-/// block counts as no better than a thousandth of the brightest pixel.
-fn hold(name: &str, ours: &[Estimate], theirs: &[Estimate]) {
-    const BLOCK: usize = 8;
-    let width = WIDTH as usize;
-    let brightest = theirs.iter().map(|pixel| pixel.mean).fold(0.0, f64::max);
-    let over = |pixels: &[usize], floor: f64| {
-        let sum = |of: &dyn Fn(&Estimate) -> f64, picture: &[Estimate]| -> f64 {
-            pixels.iter().map(|i| of(&picture[*i])).sum()
-        };
-        let count = pixels.len() as f64;
-        let means = [ours, theirs].map(|picture| sum(&|pixel| pixel.mean, picture) / count);
-        let variance: f64 =
-            [ours, theirs].map(|p| sum(&|pixel| pixel.variance, p)).iter().sum::<f64>() / count.powi(2);
-        (means, (means[0] - means[1]).abs() / (variance + floor.powi(2)).sqrt())
-    };
-    let all: Vec<usize> = (0..ours.len()).collect();
-    let ([found, expected], off) = over(&all, 1e-3 * expected_floor(theirs));
-    println!("{name}: {found:.5} of {expected:.5}, {off:.2} standard errors");
-    let columns = width / BLOCK;
-    let deviations: Vec<f64> = (0..ours.len() / BLOCK / BLOCK)
-        .map(|block| {
-            let first = block / columns * BLOCK * width + block % columns * BLOCK;
-            let pixels: Vec<usize> =
-                (0..BLOCK * BLOCK).map(|i| first + i / BLOCK * width + i % BLOCK).collect();
-            over(&pixels, 1e-3 * brightest).1
-        })
-        .collect();
-    let good = deviations.iter().filter(|z| **z < 3.0).count();
-    let worst = deviations.iter().copied().fold(0.0, f64::max);
-    println!("{name}: {good} of {} blocks within 3 standard errors, the worst {worst:.2}", deviations.len());
-    assert!(off < 3.0, "{name}: {found} instead of {expected}, {off} standard errors");
-    // Of a hundred blocks one may be off by chance; a picture this small has fewer, and one of them may be that one.
-    let chance = deviations.len().div_ceil(100);
-    assert!(good + chance >= deviations.len() && worst < 5.0, "{name}: {good}, {worst}");
-}
-
-/// The mean of a picture.
-fn expected_floor(picture: &[Estimate]) -> f64 {
-    picture.iter().map(|pixel| pixel.mean).sum::<f64>() / picture.len() as f64
-}
+use nuage_render::scene::{Emission, Phase, Scene, Shape, Spectrum, Volume};
+use nuage_volume::channel::Channel;
 
 #[test]
 fn a_cloud_in_the_sun_is_that_of_the_cpu() {
     let Some(gpu) = gpu() else { return };
     let channel = cloud();
-    let volume = uploaded(&gpu, &[&channel]);
     let mut scene = lit(&channel);
     scene.sky = Sky::Gradient {
         up: Vec3::Y,
@@ -142,7 +32,7 @@ fn a_cloud_in_the_sun_is_that_of_the_cpu() {
         horizon: [0.5, 0.4, 0.3],
         ground: [0.05, 0.04, 0.02],
     };
-    compare("grey", &gpu, &volume, &scene, PathSettings::default());
+    compare("grey", &gpu, &scene, PathSettings::default());
 }
 
 /// Everything at once: colours, heat, four kinds of lights, and a phase function of two lobes.
@@ -153,7 +43,6 @@ fn a_coloured_cloud_that_glows_among_lights_is_that_of_the_cpu() {
     let heat = channel_of([IVec3::new(-10, -40, 20), IVec3::new(40, 0, 60)], bent(), &[], |voxel| {
         common::noise(voxel.as_vec3() / 11.0)
     });
-    let volume = uploaded(&gpu, &[&channel, &heat]);
     let mut scene = lit(&channel);
     let world_box = WorldBox::of(&channel).expect("a place");
     let (centre, size) = (world_box.centre(), (world_box.max - world_box.min).length());
@@ -162,14 +51,14 @@ fn a_coloured_cloud_that_glows_among_lights_is_that_of_the_cpu() {
     scene.volumes[0].phase = Phase::Draine { g: 0.3, alpha: 2.0 };
     let spectrum = Spectrum::Linear { rgb: [0.3, 0.1, 0.02] };
     scene.volumes[0].emission = Some(Emission { channel: Some(&heat), spectrum });
-    let up = glam::DVec3::Y * size;
+    let up = DVec3::Y * size;
     let bright = |colour: [f32; 3]| colour.map(|c| c * (size * size) as f32);
     scene.lights = vec![
         Light::Sun(Sun { angle_degrees: 12.0, ..Sun::point(Vec3::new(0.6, 0.64, 0.48), [3.0, 2.0, 1.0]) }),
         Light::Point { position: centre + up, intensity: bright([2.0, 1.0, 3.0]) },
         Light::Sphere { centre: centre - up, radius: 0.3 * size, radiance: [5.0, 9.0, 4.0] },
         Light::Spot(Spot {
-            position: centre + glam::DVec3::X * size,
+            position: centre + DVec3::X * size,
             direction: Vec3::NEG_X,
             intensity: bright([9.0, 9.0, 3.0]),
             inner_degrees: 10.0,
@@ -177,5 +66,152 @@ fn a_coloured_cloud_that_glows_among_lights_is_that_of_the_cpu() {
         }),
     ];
     let settings = PathSettings { max_scatterings: Some(6), ..PathSettings::default() };
-    compare("coloured", &gpu, &volume, &scene, settings);
+    compare("coloured", &gpu, &scene, settings);
+}
+
+fn imported(name: &str) -> Channel {
+    nuage_pipeline::import::import(grid(name)).expect("a linear transform").0
+}
+
+/// A scene of the oracle: one volume before its camera, in the light of a sky and perhaps of a sun.
+fn oracle(
+    shape: Shape<'_>,
+    extinction: f32,
+    albedo: [f32; 3],
+    g: f32,
+    sky: [f32; 3],
+    has_sun: bool,
+) -> Scene<'_> {
+    let camera = Camera::look_at(DVec3::new(1.8, 1.4, 3.2), DVec3::ZERO, DVec3::Y, 36.0).expect("a view");
+    let phase = Phase::HenyeyGreenstein { g };
+    let volume = Volume { albedo, phase, ..Volume::absorbing(shape, extinction) };
+    let sun = Sun::point(Vec3::new(0.6, 0.7, 0.3).normalize(), [6.0, 5.4, 4.2]);
+    Scene::of_one(camera, volume, has_sun.then_some(sun), sky)
+}
+
+#[test]
+fn scenes_of_the_oracle_are_those_of_the_cpu() {
+    let Some(gpu) = gpu() else { return };
+    let (density, flame) = (imported("density"), imported("emission"));
+    let cloud = Shape::Grid(&density);
+    let ball = Shape::Ball { world_from_unit: DAffine3::IDENTITY };
+    let world_from_unit =
+        DAffine3::from_scale_rotation_translation(DVec3::splat(2.0), DQuat::IDENTITY, DVec3::NEG_ONE);
+    let (white, day) = ([1.0; 3], [0.3, 0.4, 0.6]);
+    let once = PathSettings { max_scatterings: Some(1), ..PathSettings::default() };
+    let any = PathSettings::default();
+    let mut emission = oracle(cloud, 1.5, [0.0; 3], 0.0, [0.0; 3], false);
+    let spectrum = Spectrum::Linear { rgb: [6.0, 2.5, 0.8] };
+    emission.volumes[0].emission = Some(Emission { channel: Some(&flame), spectrum });
+    for (name, scene, settings) in [
+        ("emission", emission, any),
+        ("het64_furnace", oracle(cloud, 8.0, white, 0.8, white, false), any),
+        ("het64_g0", oracle(cloud, 8.0, [0.99; 3], 0.0, day, true), any),
+        ("het64_g08", oracle(cloud, 8.0, [0.99; 3], 0.8, day, true), any),
+        ("het64_g0_ss", oracle(cloud, 8.0, [0.99; 3], 0.0, day, true), once),
+        ("het64_trans", oracle(cloud, 8.0, [0.0; 3], 0.0, white, false), any),
+        ("homog_cube_furnace", oracle(Shape::Box { world_from_unit }, 2.0, white, 0.0, white, false), any),
+        ("homog_sphere", oracle(ball, 4.0, [0.9, 0.6, 0.2], 0.5, white, false), any),
+        ("homog_sphere_furnace", oracle(ball, 4.0, white, 0.5, white, false), any),
+    ] {
+        compare(name, &gpu, &scene, settings);
+    }
+}
+
+/// Two grids, a box and a ball that overlap, each of another medium, and two of which glow.
+fn crowd<'a>(first: &'a Channel, second: &'a Channel) -> Scene<'a> {
+    let mut scene = lit(first);
+    let world_box = WorldBox::of(first).expect("a place");
+    let (centre, size) = (world_box.centre(), (world_box.max - world_box.min).length());
+    let strongest = scene.volumes[0].extinction[0];
+    let turned = |scale: f64, offset: DVec3| {
+        DAffine3::from_scale_rotation_translation(
+            DVec3::new(1.0, 0.7, 1.3) * size * scale,
+            DQuat::from_rotation_z(0.6),
+            centre + offset * size,
+        )
+    };
+    let kinds = [
+        (Shape::Grid(second), 0.7, [0.3, 0.6, 0.9], 0.8),
+        (Shape::Box { world_from_unit: turned(0.3, DVec3::new(-0.2, -0.3, 0.0)) }, 0.4, [0.9, 0.2, 0.5], 0.0),
+        (
+            Shape::Ball { world_from_unit: turned(0.15, DVec3::new(0.15, 0.1, 0.1)) },
+            0.3,
+            [0.8, 0.9, 0.7],
+            -0.4,
+        ),
+    ];
+    for (shape, share, albedo, g) in kinds {
+        let phase = Phase::HenyeyGreenstein { g };
+        scene.volumes.push(Volume { albedo, phase, ..Volume::absorbing(shape, share * strongest) });
+    }
+    let blackbody = |reference: f32| Spectrum::Blackbody {
+        kelvin_per_unit: 3000.0,
+        scale: 0.3 / size as f32,
+        table: Box::new(Blackbody::new(reference)),
+    };
+    scene.volumes[1].emission = Some(Emission { channel: None, spectrum: blackbody(2500.0) });
+    scene.volumes[3].emission = Some(Emission { channel: None, spectrum: blackbody(3200.0) });
+    scene
+}
+
+fn other_cloud() -> Channel {
+    channel_of([IVec3::new(0, -30, 0), IVec3::new(30, 0, 50)], bent(), &[], |voxel| {
+        common::noise(voxel.as_vec3() / 7.0)
+    })
+}
+
+#[test]
+fn volumes_that_overlap_collide_as_on_the_cpu() {
+    let Some(gpu) = gpu() else { return };
+    let (first, second) = (cloud(), other_cloud());
+    let mut scene = crowd(&first, &second);
+    let settings = PathSettings { max_scatterings: Some(8), ..PathSettings::default() };
+    compare("grey crowd", &gpu, &scene, settings);
+    let [strongest, ..] = scene.volumes[0].extinction;
+    scene.volumes[0].extinction = [0.4 * strongest, strongest, 0.1 * strongest];
+    scene.volumes[3].extinction = [0.5 * strongest, 0.0, 0.2 * strongest];
+    compare("coloured crowd", &gpu, &scene, settings);
+}
+
+/// A sky with a sharp sun in one of its texels, turned aside.
+#[test]
+fn skies_that_are_pictures_light_as_on_the_cpu() {
+    let Some(gpu) = gpu() else { return };
+    let channel = cloud();
+    let (width, height) = (20, 12);
+    let mut texels: Vec<[f32; 3]> = (0..width * height)
+        .map(|i| [0.2, 0.3, 0.5].map(|c| c * (1.0 + (TAU * i as f32 / width as f32).sin())))
+        .collect();
+    texels[2 * width as usize + 5] = [90.0, 70.0, 40.0];
+    texels[9 * width as usize..11 * width as usize].fill([0.0; 3]);
+    let turned = envmap::orientation(Vec3::new(0.2, 1.0, 0.1), 0.3);
+    let map = EnvironmentMap::new(width, height, texels, turned).expect("a sky");
+    let mut scene = lit(&channel);
+    scene.lights.clear();
+    scene.sky = Sky::Map(Arc::new(map));
+    for sky_rays in [true, false] {
+        let settings = PathSettings { sky_rays, max_scatterings: Some(4), ..PathSettings::default() };
+        compare(if sky_rays { "sky rays" } else { "no sky rays" }, &gpu, &scene, settings);
+    }
+}
+
+#[test]
+fn paths_look_values_up_as_on_the_cpu() {
+    let Some(gpu) = gpu() else { return };
+    let channel = cloud();
+    let coarse = coarser_by(&channel, 2).expect("few tiles").expect("a coarser level");
+    let mut scene = lit(&channel);
+    for lookup in [Lookup::Nearest, Lookup::StochasticTrilinear, Lookup::Tricubic, Lookup::StochasticTricubic]
+    {
+        let settings = PathSettings { lookup, max_scatterings: Some(4), ..PathSettings::default() };
+        compare(&format!("{lookup:?}"), &gpu, &scene, settings);
+    }
+    scene.volumes[0].coarse = Some(&coarse);
+    compare(
+        "a coarser level",
+        &gpu,
+        &scene,
+        PathSettings { max_scatterings: Some(4), ..PathSettings::default() },
+    );
 }

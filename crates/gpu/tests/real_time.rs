@@ -318,7 +318,7 @@ fn points_get_the_light_that_the_volume_leaves() {
     for (p, found) in points.iter().zip(&found) {
         let ray = Ray { origin: *p, direction: sun.direction_to.as_dvec3().normalize() };
         let depth = optical_depth(&field, &mut reader, &ray, Filter::Trilinear);
-        let expected = (-depth * look.extinction[0]).exp();
+        let expected = (-depth * look.media[0].extinction[0]).exp();
         worst = worst.max((found[0] - expected).abs());
         shaded += usize::from(expected < 0.9);
     }

@@ -2,13 +2,14 @@
 //!
 //! Prints two tables in Markdown. The first: bricks and look-ups of a ray and its time, from 128³ to 1024³ voxels, where cost should
 //! grow as the number of bricks that the ray crosses. The second: the same rays in the order of the picture and in none, whose
-//! difference is what memory takes. Cycles are told from a chain of multiplications timed beside each kernel, so that they stay
+//! difference is what memory takes. Resolutions may be named: `-- 128 1024`. Time is that of the processor where the system tells it, since machines are shared. Cycles are told from a chain of multiplications timed beside each kernel, so that they stay
 //! right when the clock changes. `--plot` draws the first table.
 
 #![allow(clippy::print_stdout, reason = "the tables printed are what the program is for")]
 
 use std::error::Error;
 use std::hint::black_box;
+use std::sync::OnceLock;
 use std::time::Instant;
 
 use glam::{DAffine3, DVec2, DVec3, IVec3, Vec3};
@@ -26,15 +27,16 @@ use nuage_volume::space::BRICK_VOXELS;
 use rayon::prelude::*;
 
 const RESOLUTIONS: [i32; 4] = [128, 256, 512, 1024];
-/// The sides of the picture, and of the tiles of which every fourth along both axes is made: pixels lie as close as in a picture, and
-/// bricks are met by as many of them.
+/// The sides of the picture, and of the tiles in which it is made.
 const SIZE: u32 = 1024;
 const TILE: u32 = 16;
-const EVERY: u32 = 4;
+/// Of the rays in no order one in so many is timed.
+const SHUFFLED_PART: usize = 16;
 /// The cycles of a multiplication and of an exclusive or on the processors of the last decade.
 const CHAIN_CYCLES: f64 = 4.0;
-/// A kernel is timed so often, and the median counts.
-const ROUNDS: usize = 5;
+/// A kernel is timed so often, and the median counts; each time for so long at least, since processor time is told in steps.
+const ROUNDS: usize = 3;
+const ROUND_NS: f64 = 3e8;
 /// The cloud is as large as this in the world whatever its resolution, and through its middle of so much optical depth.
 const WIDTH: f64 = 1.0;
 const EXTINCTION: f32 = 20.0;
@@ -129,15 +131,23 @@ fn met<'a>(field: &Field<'a>, accessor: &mut Accessor<'a>, ray: &Ray) -> [f64; 3
     [bricks, length * f64::from(direction.length()), length * f64::from(along)]
 }
 
+/// The nanoseconds for which this thread has had a processor; on systems that do not tell, those since the first call.
+fn processor_ns() -> f64 {
+    static FIRST: OnceLock<Instant> = OnceLock::new();
+    let told = std::fs::read_to_string("/proc/thread-self/schedstat").ok();
+    let told = told.and_then(|line| line.split_whitespace().next()?.parse().ok());
+    told.unwrap_or_else(|| FIRST.get_or_init(Instant::now).elapsed().as_secs_f64() * 1e9)
+}
+
 /// The nanoseconds of a cycle now.
 fn cycle_ns() -> f64 {
     const PRODUCTS: u32 = 1 << 22;
     let factor = black_box(0xbf58_476d_1ce4_e5b9_u64);
-    let begin = Instant::now();
+    let begin = processor_ns();
     // Each product waits for the one before.
     let product = (0..PRODUCTS).fold(factor, |product, i| product.wrapping_mul(factor) ^ u64::from(i));
     black_box(product);
-    begin.elapsed().as_secs_f64() * 1e9 / f64::from(PRODUCTS) / CHAIN_CYCLES
+    (processor_ns() - begin) / f64::from(PRODUCTS) / CHAIN_CYCLES
 }
 
 fn median(mut values: Vec<f64>) -> f64 {
@@ -148,16 +158,20 @@ fn median(mut values: Vec<f64>) -> f64 {
 /// The nanoseconds of a ray on one thread.
 fn ray_ns<'a>(kernel: &str, field: &Field<'a>, rays: &[Ray]) -> f64 {
     let mut reader = field.reader();
-    let mut round = || {
-        let begin = Instant::now();
-        let packets = rays.as_chunks::<RAYS>().0.iter().zip(0..);
-        let sum: f32 = packets.map(|(rays, i)| work(kernel, field, &mut reader, rays, 1024 * i)).sum();
-        black_box(sum);
-        begin.elapsed().as_secs_f64() * 1e9 / rays.len() as f64
+    let mut ns_of = |passes: u32| {
+        let begin = processor_ns();
+        for pass in 0..passes {
+            let packets = rays.as_chunks::<RAYS>().0.iter().zip(0..);
+            let sum: f32 =
+                packets.map(|(rays, i)| work(kernel, field, &mut reader, rays, 1024 * i + pass)).sum();
+            black_box(sum);
+        }
+        (processor_ns() - begin) / f64::from(passes)
     };
     // Bricks are decoded by the first who meets them.
-    round();
-    median((0..ROUNDS).map(|_| round()).collect())
+    ns_of(1);
+    let passes = (ROUND_NS / ns_of(1).max(1e6)).ceil() as u32;
+    median((0..ROUNDS).map(|_| ns_of(passes)).collect()) / rays.len() as f64
 }
 
 /// The rays of a picture, tile by tile as the renderer makes it.
@@ -165,28 +179,27 @@ fn rays() -> Result<Vec<Ray>, Box<dyn Error>> {
     let middle = DVec3::splat(0.5 * WIDTH);
     let camera = Camera::look_at(middle + DVec3::new(0.9, 0.5, 1.4) * WIDTH, middle, DVec3::Y, 40.0)
         .ok_or("no view")?;
-    let columns = SIZE / TILE / EVERY;
+    let columns = SIZE / TILE;
     let pixel = |i: u32| {
         let (tile, i) = (i / (TILE * TILE), i % (TILE * TILE));
-        let (left, top) = (tile % columns * TILE * EVERY, tile / columns * TILE * EVERY);
+        let (left, top) = (tile % columns * TILE, tile / columns * TILE);
         let packet = i / RAYS as u32;
         let (left, top) = (left + packet % (TILE / SIDE) * SIDE, top + packet / (TILE / SIDE) * SIDE);
         let [x, y] = square(left, top)[i as usize % RAYS];
         DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5)
     };
-    let count = (SIZE / EVERY).pow(2);
-    Ok((0..count).map(|i| camera.ray(pixel(i), SIZE, SIZE)).collect())
+    Ok((0..SIZE * SIZE).map(|i| camera.ray(pixel(i), SIZE, SIZE)).collect())
 }
 
-/// The same in an order that no cache knows.
+/// Some of them in an order that no cache knows.
 fn shuffled(rays: &[Ray]) -> Vec<Ray> {
     let mut order: Vec<u32> = (0..rays.len() as u32).collect();
     order.sort_by_key(|i| hash_u32(*i));
-    order.iter().map(|i| rays[*i as usize]).collect()
+    order.iter().step_by(SHUFFLED_PART).map(|i| rays[*i as usize]).collect()
 }
 
 /// A line per kernel, the bricks that a ray crosses to the right and its nanoseconds upwards, both in logarithms.
-fn plot(points: &[(f64, Vec<f64>)]) -> String {
+fn plot(resolutions: &[i32], points: &[(f64, Vec<f64>)]) -> String {
     let (width, height, margin) = (560.0, 360.0, 60.0);
     let last = points.len() - 1;
     let range = |values: Vec<f64>| {
@@ -204,7 +217,7 @@ fn plot(points: &[(f64, Vec<f64>)]) -> String {
     let text = |x: f64, y: f64, anchor: &str, text: &str| {
         format!("<text x=\"{x:.0}\" y=\"{y:.0}\" text-anchor=\"{anchor}\">{text}</text>\n")
     };
-    for ((bricks, ns), resolution) in points.iter().zip(RESOLUTIONS) {
+    for ((bricks, ns), resolution) in points.iter().zip(resolutions) {
         svg += &text(x(*bricks), height - margin + 18.0, "middle", &format!("{resolution}³"));
         svg += &text(x(*bricks), height - margin + 34.0, "middle", &format!("{bricks:.1}"));
         svg += &text(margin - 8.0, y(ns[3]) + 4.0, "end", &format!("{:.0}", ns[3]));
@@ -240,6 +253,8 @@ fn plot(points: &[(f64, Vec<f64>)]) -> String {
 fn main() -> Result<(), Box<dyn Error>> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let plot_file = arguments.iter().position(|a| a == "--plot").and_then(|i| arguments.get(i + 1));
+    let named: Vec<i32> = arguments.iter().filter_map(|argument| argument.parse().ok()).collect();
+    let resolutions = if named.is_empty() { RESOLUTIONS.to_vec() } else { named };
     let rays = rays()?;
     let scattered = shuffled(&rays);
     let mut points = Vec::new();
@@ -248,8 +263,8 @@ fn main() -> Result<(), Box<dyn Error>> {
         "| voxels | bricks | MB | bricks per ray | kernel | look-ups per ray | ns per ray | ns per brick | ns per look-up | cycles per look-up |"
     );
     println!("| ---: | ---: | ---: | ---: | --- | ---: | ---: | ---: | ---: | ---: |");
-    for resolution in RESOLUTIONS {
-        let channel = cloud(resolution)?;
+    for resolution in &resolutions {
+        let channel = cloud(*resolution)?;
         let field = Field::new(&channel).ok_or("no cloud")?;
         let mut accessor = Accessor::new(&channel.tree);
         let mut sums = [0.0; 3];
@@ -291,7 +306,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     if let Some(file) = plot_file {
         // Cargo runs benchmarks in the folder of their package.
         let root = concat!(env!("CARGO_MANIFEST_DIR"), "/../..");
-        std::fs::write(std::path::Path::new(root).join(file), plot(&points))?;
+        std::fs::write(std::path::Path::new(root).join(file), plot(&resolutions, &points))?;
     }
     Ok(())
 }

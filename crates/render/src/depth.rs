@@ -460,6 +460,13 @@ pub(crate) fn corners_from(block: &Block, offset: usize) -> &[f32; CORNERS_SPAN]
     }
 }
 
+/// The values from the first to the last corner of the cell around a position in a brick.
+#[inline(always)]
+pub(crate) fn corners_around(block: &Block, position: Vec3) -> &[f32; CORNERS_SPAN] {
+    let cell = position.min(Vec3::splat(LAST_CELL_END)).as_ivec3();
+    corners_from(block, (cell.x * 81 + cell.y * 9 + cell.z) as usize)
+}
+
 /// The eight corners of a cell, whose coordinates in the brick are whole numbers from 0 to 7: corner `i` at
 /// `dx << 2 | dy << 1 | dz`.
 #[inline(always)]

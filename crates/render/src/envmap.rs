@@ -18,7 +18,7 @@ pub const MAX_RADIANCE: f32 = 1e30;
 
 /// Shares are counted in these parts of the whole. It is as fine as [`unit_f32`](crate::hash::unit_f32):
 /// every number that it can return belongs to one texel, so that chances are exact.
-const PARTS: u32 = 1 << 24;
+pub const PARTS: u32 = 1 << 24;
 
 /// Why a picture can't be an [`EnvironmentMap`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
@@ -77,6 +77,25 @@ pub struct EnvironmentMap {
     row_ends: Vec<u32>,
     /// The same for the columns of each row, row by row. All 0 in rows without light.
     column_ends: Vec<u32>,
+}
+
+/// What an [`EnvironmentMap`] is made of, for renderers that look it up by themselves.
+#[derive(Debug, Clone, Copy)]
+pub struct EnvironmentParts<'m> {
+    /// In texels.
+    pub width: u32,
+    /// In texels.
+    pub height: u32,
+    /// Radiance, from the top left, row by row.
+    pub texels: &'m [[f32; 3]],
+    /// Takes directions of the world to those of the map.
+    pub map_from_world: Mat3,
+    /// The solid angle of a texel of each row.
+    pub solid_angles: &'m [f32],
+    /// For each row, which of [`PARTS`] is the first that belongs to the row behind it.
+    pub row_ends: &'m [u32],
+    /// The same for the columns of each row, row by row. All 0 in rows without light.
+    pub column_ends: &'m [u32],
 }
 
 /// A direction towards an environment, chosen by its light.
@@ -159,6 +178,19 @@ impl EnvironmentMap {
     #[inline]
     fn texel(&self, x: u32, y: u32) -> [f32; 3] {
         self.texels.get(y as usize * self.width as usize + x as usize).copied().unwrap_or_default()
+    }
+
+    /// What it is made of.
+    pub fn parts(&self) -> EnvironmentParts<'_> {
+        EnvironmentParts {
+            width: self.width,
+            height: self.height,
+            texels: &self.texels,
+            map_from_world: self.map_from_world,
+            solid_angles: &self.solid_angles,
+            row_ends: &self.row_ends,
+            column_ends: &self.column_ends,
+        }
     }
 
     /// Whether no light comes from anywhere.

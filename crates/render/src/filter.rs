@@ -22,7 +22,7 @@ pub enum Filter {
 }
 
 /// How a renderer looks up the value at a point.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash)]
 pub enum Lookup {
     /// [`nearest`].
     Nearest,

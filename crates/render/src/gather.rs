@@ -53,20 +53,20 @@ pub(crate) fn gather_u16<S: Simd>(simd: S, values: &[u16], at: i32x16<S>) -> u32
     u32x16::simd_from(simd, found)
 }
 
-/// Asks for the lines of the cache in which places of a slice stand, so that they are near when they are looked up; on other
-/// processors than x86-64 it asks for nothing.
+/// Asks for the lines of the cache in which values stand, so that they are near when they are looked up; on other processors
+/// than x86-64 it asks for nothing.
 #[inline(always)]
 #[cfg_attr(not(target_arch = "x86_64"), expect(unused_variables, reason = "there is no such instruction"))]
-pub(crate) fn prefetch<S: Simd, V>(values: &[V], at: i32x16<S>) {
+pub(crate) fn prefetch<V>(values: &[V]) {
     #[cfg(target_arch = "x86_64")]
     {
         use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
-        let at = at.to_array();
-        let _: [(); 16] = each_ray!(|lane| {
-            let place = values.as_ptr().wrapping_add(at[lane] as u32 as usize);
+        const LINE_BYTES: usize = 64;
+        for line in 0..size_of_val(values).div_ceil(LINE_BYTES) {
+            let place = values.as_ptr().cast::<i8>().wrapping_add(line * LINE_BYTES);
             // SAFETY: the instruction is a hint, which does nothing where there is no memory.
-            unsafe { _mm_prefetch::<_MM_HINT_T0>(place.cast()) }
-        });
+            unsafe { _mm_prefetch::<_MM_HINT_T0>(place) }
+        }
     }
 }
 

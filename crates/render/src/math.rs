@@ -32,6 +32,11 @@ pub const ROOT_HALF: i32 = 0x3f35_04f3;
 pub const SIN_SERIES: [f32; 3] = [-75.399_025, 81.592_49, -41.341_663];
 /// As [`SIN_SERIES`].
 pub const COS_SERIES: [f32; 4] = [59.422_474, -85.448_79, 64.939_37, -19.739_208];
+/// tan of a sixteenth of a turn.
+pub const TAN_SIXTEENTH: f32 = 0.414_213_57;
+/// The polynomial of [`atan2_turns`] in the square of the tangent, from the highest power down.
+pub const ATAN_SERIES: [f32; 5] =
+    [1.271_049_5e-2, -2.204_604_6e-2, 3.179_033_5e-2, -5.305_079_7e-2, 1.591_549_4e-1];
 
 /// e^x as 2^n · (1 + q) with |ln(1 + q)| <= ln(2) / 2: returns `q`, and n in the low nine bits of the second
 /// value.
@@ -133,21 +138,22 @@ pub fn sin_cos_turns(turns: f32) -> (f32, f32) {
 /// sixteenth of a turn; its odd polynomial is fitted for the least relative error, 2e-8 before rounding.
 #[inline]
 pub fn atan2_turns(y: f32, x: f32) -> f32 {
-    /// tan of a sixteenth of a turn.
-    const SIXTEENTH: f32 = 0.414_213_57;
     let (across, along) = (y.abs(), x.abs());
     let (least, most) = (across.min(along), across.max(along));
     if most == 0.0 {
         return 0.0;
     }
     // Of the tangent's two forms the one whose quotient is small; neither divides by 0.
-    let (offset, z) =
-        if least > SIXTEENTH * most { (0.125, (least - most) / (least + most)) } else { (0.0, least / most) };
+    let (offset, z) = if least > TAN_SIXTEENTH * most {
+        (0.125, (least - most) / (least + most))
+    } else {
+        (0.0, least / most)
+    };
     let y2 = z * z;
-    let p = y2 * 1.271_049_5e-2 - 2.204_604_6e-2;
-    let p = p * y2 + 3.179_033_5e-2;
-    let p = p * y2 - 5.305_079_7e-2;
-    let octant = offset + z * (p * y2 + 1.591_549_4e-1);
+    let p = y2 * ATAN_SERIES[0] + ATAN_SERIES[1];
+    let p = p * y2 + ATAN_SERIES[2];
+    let p = p * y2 + ATAN_SERIES[3];
+    let octant = offset + z * (p * y2 + ATAN_SERIES[4]);
     let quadrant = if across > along { 0.25 - octant } else { octant };
     let half = if x < 0.0 { 0.5 - quadrant } else { quadrant };
     if y < 0.0 { -half } else { half }

@@ -33,6 +33,22 @@ struct Light {
     aim: vec4<f32>,
 }
 
+struct Medium {
+    // Extinction of the three colours, and the largest of them.
+    extinction: vec4<f32>,
+    albedo: vec4<f32>,
+    phase: Phase,
+    // Radiance per value, then -1; or a black body's scale in the first, then kelvin per unit.
+    emission: vec4<f32>,
+    // What it is, the channel of its densities, that which rays of scattered light read, and that which glows: NONE if
+    // nothing does, SOLID_CHANNEL if a solid does itself.
+    kind: vec4<u32>,
+    // Rows of what takes the world to a solid's unit cube or ball.
+    unit_x: vec4<f32>,
+    unit_y: vec4<f32>,
+    unit_z: vec4<f32>,
+}
+
 struct Params {
     camera: vec4<f32>,
     forward: vec4<f32>,
@@ -42,12 +58,6 @@ struct Params {
     size: vec4<u32>,
     // Samples, most scatterings, what a view shows, lights.
     counts: vec4<u32>,
-    // Extinction of the three colours, and the largest of them.
-    extinction: vec4<f32>,
-    albedo: vec4<f32>,
-    phase: Phase,
-    // Radiance per value, then -1; or a black body's scale in the first, then kelvin per unit.
-    emission: vec4<f32>,
     sky_up: vec4<f32>,
     sky_zenith: vec4<f32>,
     sky_horizon: vec4<f32>,
@@ -70,13 +80,13 @@ struct Params {
     // Width and height of what is marched, pixels of the picture along each side of one of its pixels, and the number of the
     // picture.
     marched: vec4<u32>,
-    // In positions of the density's field: the node of the light volume nearest to the sun, and the way to the next node along
+    // In positions of the field that shadow rays meet: the node of the light volume nearest to the sun, and the way to the next node along
     // each of its axes; last, the world length of that away from the sun.
     light_first: vec4<f32>,
     light_x: vec4<f32>,
     light_y: vec4<f32>,
     light_z: vec4<f32>,
-    // Rows of what takes positions of the density's field to coordinates of the light volume.
+    // Rows of what takes positions of that field to coordinates of the light volume.
     light_u: vec4<f32>,
     light_v: vec4<f32>,
     light_w: vec4<f32>,
@@ -87,7 +97,15 @@ struct Params {
     before_up: vec4<f32>,
     // The most pictures that a mean counts as, whether colours before are clamped, whether the camera moved.
     history: vec4<f32>,
+    // Rows of what takes the world to the map of the sky, and its width and height.
+    map_x: vec4<f32>,
+    map_y: vec4<f32>,
+    map_z: vec4<f32>,
+    map_size: vec4<u32>,
+    media: array<Medium, MAX_MEDIA>,
     lights: array<Light, MAX_LIGHTS>,
+    // Of black bodies by their temperature: colour of luminance 1, and the logarithm of the luminance.
+    blackbody: array<vec4<f32>, BLACKBODY_ROWS>,
 }
 
 @group(0) @binding(0) var<storage, read> tree: array<u32>;

@@ -116,14 +116,30 @@ fn bc7_texel(at: u32, texel: u32, channel_asked: u32) -> f32 {
     return f32((ends[0] * (64u - weight) + ends[1] * weight + 32u) >> 6u) / 255.0;
 }
 
+// A voxel as its place in slices and along the packing axis.
+fn in_slices(kind: u32, p: vec3<u32>) -> vec3<u32> {
+    switch (kind & 3u) {
+        case 0u: { return p.yzx; }
+        case 1u: { return p.xzy; }
+        default: { return p; }
+    }
+}
+
+// The value of a voxel of the brick of a number in the texture of its format: crate::blocks has where that lies.
+fn texture_value(kind: u32, number: u32, p: vec3<u32>) -> f32 {
+    let uvp = in_slices(kind, p);
+    let format = kind >> 2u;
+    let channels = select(4u, 1u, format == 0u);
+    let log2_side = countTrailingZeros(blocks_width(format)) - LOG2_BRICK;
+    let beside = (1u << log2_side) - 1u;
+    let place = vec3<u32>(number & beside, (number >> log2_side) & beside, number >> (2u * log2_side));
+    let first = (place << vec3<u32>(LOG2_BRICK)) / vec3<u32>(1u, 1u, channels);
+    return block_texel(format, first + vec3<u32>(uvp.xy, uvp.z / channels))[uvp.z % channels];
+}
+
 // `kind` is the format times four, BC4, BC3 or BC7, plus the packing axis.
 fn block_value(kind: u32, at: u32, p: vec3<u32>) -> f32 {
-    var uvp = p;
-    switch (kind & 3u) {
-        case 0u: { uvp = p.yzx; }
-        case 1u: { uvp = p.xzy; }
-        default: {}
-    }
+    let uvp = in_slices(kind, p);
     let format = kind >> 2u;
     let channels = select(4u, 1u, format == 0u);
     let block = ((uvp.z / channels) << 2u) | ((uvp.y >> 2u) << 1u) | (uvp.x >> 2u);

@@ -167,7 +167,11 @@ fn plain_value(tag: u32, at: u32, unit: f32, p: vec3<u32>) -> f32 {
     }
     if (HAS_BLOCK && tag >= FIRST_BLOCK_TAG) {
         let line = line_of(brick_word(at), unit);
-        return line.low + line.step * block_value(tag - FIRST_BLOCK_TAG, at + 1u, p);
+        let kind = tag - FIRST_BLOCK_TAG;
+        if (HAS_TEXTURES) {
+            return line.low + line.step * texture_value(kind, brick_word(at + 1u), p);
+        }
+        return line.low + line.step * block_value(kind, at + 1u, p);
     }
     if (HAS_LATTICE && tag >= FIRST_LATTICE_TAG) {
         return lattice_value(at, unit, p) + rest_value(at + 17u, unit, tag - FIRST_LATTICE_TAG, voxel);

@@ -61,8 +61,74 @@ fn nearest(field: u32, accessor: ptr<function, Accessor>, position: vec3<f32>) -
 }
 
 // One voxel, chosen so that the mean over many reads is `trilinear`.
-fn stochastic(field: u32, accessor: ptr<function, Accessor>, position: vec3<f32>, random: vec3<f32>) -> f32 {
+fn trilinear_voxel(field: u32, accessor: ptr<function, Accessor>, position: vec3<f32>, random: vec3<f32>) -> f32 {
     let corner = floor(position);
     let chosen = vec3<i32>(random >= 1.0 - (position - corner));
     return voxel_value(field, accessor, vec3<i32>(corner) + chosen + base_voxel(field));
+}
+
+// The weights of the uniform cubic B-spline, for the voxels from one before the cell to one behind it; `x` in the cell.
+fn cubic_weights(x: f32) -> vec4<f32> {
+    let y = 1.0 - x;
+    let inner = 2.0 / 3.0 - vec2<f32>(x * x * (1.0 - 0.5 * x), y * y * (1.0 - 0.5 * y));
+    return vec4<f32>(y * y * y / 6.0, inner, x * x * x / 6.0);
+}
+
+// The cubic B-spline, by eight interpolations between two voxels along each axis.
+fn tricubic(field: u32, accessor: ptr<function, Accessor>, position: vec3<f32>) -> f32 {
+    let cell = floor(position);
+    let inside = position - cell;
+    let x = cubic_weights(inside.x);
+    let y = cubic_weights(inside.y);
+    let z = cubic_weights(inside.z);
+    let low = vec3<f32>(x.x + x.y, y.x + y.y, z.x + z.y);
+    let high = vec3<f32>(x.z + x.w, y.z + y.w, z.z + z.w);
+    let low_place = vec3<f32>(x.y, y.y, z.y) / low;
+    let high_place = vec3<f32>(x.w, y.w, z.w) / high;
+    let first = vec3<i32>(cell) + base_voxel(field);
+    var sum = 0.0;
+    for (var i = 0; i < 8; i++) {
+        let is_high = vec3<bool>((i & 4) != 0, (i & 2) != 0, (i & 1) != 0);
+        let weight = select(low, high, is_high);
+        let corners = corners_of(field, accessor, first + select(vec3<i32>(-1), vec3<i32>(1), is_high));
+        sum += weight.x * weight.y * weight.z * lerp8(corners, select(low_place, high_place, is_high));
+    }
+    return sum;
+}
+
+// How many weights a number passes.
+fn chosen_of(weights: vec4<f32>, random: f32) -> i32 {
+    let ends = vec3<f32>(weights.x, weights.x + weights.y, weights.x + weights.y + weights.z);
+    let passed = vec3<i32>(vec3<f32>(random) >= ends);
+    return passed.x + passed.y + passed.z;
+}
+
+// One voxel, chosen so that the mean over many reads is `tricubic`.
+fn tricubic_voxel(field: u32, accessor: ptr<function, Accessor>, position: vec3<f32>, random: vec3<f32>) -> f32 {
+    let cell = floor(position);
+    let inside = position - cell;
+    let chosen = vec3<i32>(
+        chosen_of(cubic_weights(inside.x), random.x), chosen_of(cubic_weights(inside.y), random.y),
+        chosen_of(cubic_weights(inside.z), random.z),
+    );
+    return voxel_value(field, accessor, vec3<i32>(cell) - 1 + chosen + base_voxel(field));
+}
+
+// The value at a position, by a filter that is known when the shader is made.
+fn look_up(
+    lookup: u32, field: u32, accessor: ptr<function, Accessor>, position: vec3<f32>, random: vec3<f32>,
+) -> f32 {
+    if (lookup == LOOKUP_NEAREST) {
+        return nearest(field, accessor, position);
+    }
+    if (lookup == LOOKUP_TRICUBIC) {
+        return tricubic(field, accessor, position);
+    }
+    if (lookup == LOOKUP_STOCHASTIC_TRILINEAR) {
+        return trilinear_voxel(field, accessor, position, random);
+    }
+    if (lookup == LOOKUP_STOCHASTIC_TRICUBIC) {
+        return tricubic_voxel(field, accessor, position, random);
+    }
+    return trilinear(field, accessor, position);
 }

@@ -28,6 +28,27 @@ fn random_unit(random: ptr<function, Random>) -> f32 {
     return unit_f32(hash_u32(hash_u32(path + (*random).count) ^ rotate_left(path, 16u)));
 }
 
+// Three numbers for one voxel that is chosen, where one is.
+fn random_3d(random: ptr<function, Random>) -> vec3<f32> {
+    if (LOOKUP == MEAN_LOOKUP) {
+        return vec3<f32>(0.0);
+    }
+    return vec3<f32>(random_unit(random), random_unit(random), random_unit(random));
+}
+
+// The same by a seed.
+fn three(seed: u32) -> vec3<f32> {
+    let hashed = hash_u32(seed);
+    return vec3<f32>(
+        unit_f32(hash_u32(hashed + 1u)), unit_f32(hash_u32(hashed + 2u)), unit_f32(hash_u32(hashed + 3u)),
+    );
+}
+
+// Whether a path has to end, whatever is to be found: devices are lost that do not come to an end.
+fn has_drawn_enough(random: ptr<function, Random>) -> bool {
+    return (*random).count >= MAX_DRAWS;
+}
+
 // An optical depth at which a ray collides.
 fn random_depth(random: ptr<function, Random>) -> f32 {
     return -ln(1.0 - random_unit(random));

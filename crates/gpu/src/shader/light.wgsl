@@ -1,4 +1,4 @@
-// Lights and the sky: nuage_render::light.
+// Lights: nuage_render::light.
 
 // What arrives of a light at a point in clear air: from one direction, or evenly from a cone if `spread` is above 0.
 struct Arriving { light: vec3<f32>, direction: vec3<f32>, distance: f32, spread: f32 }
@@ -51,11 +51,4 @@ fn sample_cone(axis: vec3<f32>, spread: f32, u: vec2<f32>) -> vec3<f32> {
     let frame = tangent_frame(axis);
     let across = frame.tangent * (across_length * turn.y) + frame.bitangent * (across_length * turn.x);
     return normalize(axis * (1.0 - from_axis) + across);
-}
-
-fn sky_radiance(direction: vec3<f32>) -> vec3<f32> {
-    let height = clamp(dot(params.sky_up.xyz, direction), -1.0, 1.0);
-    let pole = select(params.sky_zenith.xyz, params.sky_ground.xyz, height < 0.0);
-    let level = max(1.0 - height * height, 0.0);
-    return pole + (params.sky_horizon.xyz - pole) * (level * level * level * level);
 }

@@ -12,11 +12,11 @@ fn light_volume(@builtin(global_invocation_id) id: vec3<u32>) {
     if (any(id.xy >= vec2<u32>(LIGHT_NODES))) {
         return;
     }
-    let field = field_of(DENSITY_CHANNEL);
+    let field = field_of(SHADOW_CHANNEL);
     // A ray away from the sun, whose t counts nodes.
     let first = params.light_first.xyz + f32(id.x) * params.light_x.xyz + f32(id.y) * params.light_y.xyz;
     let ray = local_ray(first, params.light_z.xyz);
-    let scale = params.extinction.x * params.light_z.w;
+    let scale = params.media[0].extinction.x * params.light_z.w;
     let step = params.march_rays.w / length(ray.direction);
     let span = field_interval(field, ray, 0.0);
     var node = 0u;
@@ -36,7 +36,7 @@ fn light_volume(@builtin(global_invocation_id) id: vec3<u32>) {
             let t = run.t0 + piece * length;
             var value = run.value;
             if (run.is_varying) {
-                value = trilinear(field, &accessor, ray_at(ray, t + 0.5 * length));
+                value = look_up(MEAN_LOOKUP, field, &accessor, ray_at(ray, t + 0.5 * length), vec3<f32>(0.0));
             }
             while (node < LIGHT_NODES && f32(node) < t + length) {
                 store_node(id.xy, node, depth + value * scale * max(f32(node) - t, 0.0));

@@ -35,6 +35,7 @@ struct Group { share: f32, moment: f32, start: f32 }
 
 // The light on the medium along one camera ray.
 struct Lighting {
+    // What shadow rays meet, and the camera ray there.
     field: u32,
     view: vec3<f32>,
     ray: LocalRay,
@@ -55,19 +56,23 @@ struct Lighting {
 // What shadow rays remember.
 var<private> shadow_accessor: Accessor;
 
-fn new_lighting(field: u32, ray: Ray, start: f32, local: LocalRay, random: u32) -> Lighting {
+fn new_lighting(ray: Ray, start: f32, local: LocalRay, random: u32) -> Lighting {
+    let field = field_of(SHADOW_CHANNEL);
     var lighting: Lighting;
     lighting.field = field;
     lighting.view = ray.direction;
     lighting.ray = local;
+    if (SHADOW_CHANNEL != DENSITY_CHANNEL) {
+        lighting.ray = moved(field, ray, start);
+    }
     lighting.voxels_per_length = length(local.direction);
     lighting.voxels_to_start = start * lighting.voxels_per_length;
-    let phase = params.phase;
+    let phase = params.media[0].phase;
     let scatters = phase_between(phase, params.sun_direction.xyz, ray.direction);
-    lighting.sun = params.sun_irradiance.xyz * params.albedo.xyz * scatters;
+    lighting.sun = params.sun_irradiance.xyz * params.media[0].albedo.xyz * scatters;
     lighting.has_sun = any(lighting.sun != vec3<f32>(0.0));
     lighting.sun_direction = directions(field, params.sun_direction.xyz);
-    lighting.sky = params.sky_zenith.xyz * params.albedo.xyz;
+    lighting.sky = params.sky_zenith.xyz * params.media[0].albedo.xyz;
     lighting.has_sky = any(lighting.sky != vec3<f32>(0.0)) && params.march_rays.y > 0.0;
     lighting.next_sky = unit_f32(hash_u32(random ^ SKY_SEED)) / max(params.march_rays.y, 1.0);
     lighting.random = random;
@@ -77,6 +82,7 @@ fn new_lighting(field: u32, ray: Ray, start: f32, local: LocalRay, random: u32) 
 // The optical depth of a ray up to `end`, given up once it passes `limit`.
 fn optical_depth(field: u32, ray: LocalRay, end: f32, lattice: Lattice, scale: f32, limit: f32) -> f32 {
     var depth = 0.0;
+    let seed = hash_u32(bitcast<u32>(lattice.shift));
     var accessor = shadow_accessor;
     var runs = runs_between(field, ray, 0.0, end);
     loop {
@@ -91,7 +97,8 @@ fn optical_depth(field: u32, ray: LocalRay, end: f32, lattice: Lattice, scale: f
                 if (step.x >= step.y) {
                     break;
                 }
-                let value = trilinear(field, &accessor, ray_at(ray, 0.5 * (step.x + step.y)));
+                let t = 0.5 * (step.x + step.y);
+                let value = look_up(LOOKUP, field, &accessor, ray_at(ray, t), three(seed ^ bitcast<u32>(t)));
                 depth += value * scale * (step.y - step.x);
                 if (depth > limit) {
                     break;
@@ -108,15 +115,29 @@ fn optical_depth(field: u32, ray: LocalRay, end: f32, lattice: Lattice, scale: f
     return depth;
 }
 
+// The share of the light from the direction of a ray that gets to where it begins, without steps.
+fn exact_transmittance(field: u32, ray: LocalRay) -> f32 {
+    var depth: f32;
+    if (MEAN_LOOKUP == LOOKUP_NEAREST) {
+        depth = voxel_integral(field, ray);
+    } else {
+        depth = line_integral(field, ray, field_exit(field, ray));
+    }
+    return exp_(-params.media[0].extinction.x * depth);
+}
+
 // The share of the light from a direction that gets to a place on the camera ray.
 fn march_transmittance(lighting: ptr<function, Lighting>, t: f32, direction: vec3<f32>) -> f32 {
     let ray = local_ray(ray_at((*lighting).ray, t), direction);
+    if (HAS_EXACT_SHADOWS) {
+        return exact_transmittance((*lighting).field, ray);
+    }
     let voxel = u32(i32(floor((*lighting).voxels_to_start + t * (*lighting).voxels_per_length)));
     let shift = unit_f32(hash_u32((*lighting).random ^ hash_u32(voxel ^ ((*lighting).sky_index << 24u))));
     let step = params.march.y / length(direction);
     let lattice = Lattice(step, shift, params.march.z / step);
     let end = field_exit((*lighting).field, ray);
-    let depth = optical_depth((*lighting).field, ray, end, lattice, params.extinction.x, params.march_rays.z);
+    let depth = optical_depth((*lighting).field, ray, end, lattice, params.media[0].extinction.x, params.march_rays.z);
     return exp_(-depth);
 }
 
@@ -126,7 +147,7 @@ fn sky_direction(lighting: ptr<function, Lighting>) -> vec3<f32> {
     let index = (*lighting).sky_index;
     let u = vec2<f32>(unit_f32(start + index * PLASTIC_X), unit_f32(hash_u32(start) + index * PLASTIC_Y));
     (*lighting).sky_index += 1u;
-    return directions((*lighting).field, sample_phase(params.phase, (*lighting).view, u));
+    return directions((*lighting).field, sample_phase(params.media[0].phase, (*lighting).view, u));
 }
 
 // The light scattered towards the camera by a step that accounts for `share` of the camera's light, or by a group of
@@ -225,11 +246,11 @@ fn march_radiance(ray: Ray, max_distance: f32, random: u32, shift: f32) -> vec4<
     );
     let step_length = params.march.x / voxels_per_length;
     let lattice = Lattice(step_length, fract(shift - start / step_length), 0.0);
-    var lighting = new_lighting(density, ray, start, local, random);
+    var lighting = new_lighting(ray, start, local, random);
     lighting.has_sun = lighting.has_sun && has_density;
     lighting.has_sky = lighting.has_sky && has_density;
     let is_lit = lighting.has_sun || lighting.has_sky;
-    let scale = params.extinction.x;
+    let scale = params.media[0].extinction.x;
 
     var walker = new_accessor();
     var glow_walker = new_accessor();
@@ -295,15 +316,15 @@ fn march_radiance(ray: Ray, max_distance: f32, random: u32, shift: f32) -> vec4<
             let t = 0.5 * (step.x + step.y);
             var value = constant_density;
             if (density_varies) {
-                value = trilinear(density, &walker, ray_at(local, t));
+                value = look_up(LOOKUP, density, &walker, ray_at(local, t), three(random ^ bitcast<u32>(t)));
             }
             var emitted = vec3<f32>(0.0);
             if (HAS_EMISSION && glows) {
                 var glow_value = constant_glow;
                 if (glow_varies) {
-                    glow_value = trilinear(glow, &glow_walker, ray_at(glow_local, t));
+                    glow_value = look_up(MEAN_LOOKUP, glow, &glow_walker, ray_at(glow_local, t), vec3<f32>(0.0));
                 }
-                emitted = spectrum_radiance(glow_value);
+                emitted = spectrum_radiance(params.media[0].emission, glow_value);
             }
             let length = step.y - step.x;
             let depth = min(value * scale * length, MAX_F32);

@@ -56,6 +56,28 @@ fn sin_cos_turns(turns: f32) -> vec2<f32> {
     return select(-turned, turned, (quarter & 2u) == 0u);
 }
 
+// The angle from the x axis to a point, in turns.
+fn atan2_turns(y: f32, x: f32) -> f32 {
+    let across = abs(y);
+    let along = abs(x);
+    let least = min(across, along);
+    let most = max(across, along);
+    if (most == 0.0) {
+        return 0.0;
+    }
+    // Of the tangent's two forms the one whose quotient is small; neither divides by 0.
+    let is_beyond = least > TAN_SIXTEENTH * most;
+    let z = select(least / most, (least - most) / (least + most), is_beyond);
+    let y2 = z * z;
+    var p = y2 * ATAN_SERIES_0 + ATAN_SERIES_1;
+    p = p * y2 + ATAN_SERIES_2;
+    p = p * y2 + ATAN_SERIES_3;
+    let octant = select(0.0, 0.125, is_beyond) + z * (p * y2 + ATAN_SERIES_4);
+    let quadrant = select(octant, 0.25 - octant, across > along);
+    let half = select(quadrant, 0.5 - quadrant, x < 0.0);
+    return select(half, -half, y < 0.0);
+}
+
 fn max_component(v: vec3<f32>) -> f32 {
     return max(v.x, max(v.y, v.z));
 }

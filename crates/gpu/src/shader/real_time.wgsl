@@ -12,7 +12,7 @@ fn step_shift(marched: vec2<u32>, random: u32) -> f32 {
     return fract(noise + unit_f32(params.marched.w * GOLDEN));
 }
 
-// The share of the sun's light that gets to a position of the density's field.
+// The share of the sun's light that gets to a position of the field that shadow rays meet.
 fn cached_transmittance(position: vec3<f32>) -> f32 {
     let p = vec4<f32>(position, 1.0);
     let at = vec3<f32>(dot(params.light_u, p), dot(params.light_v, p), dot(params.light_w, p));

@@ -2,17 +2,20 @@
 
 // In single precision a ray that begins far away sees the volume tremble: it begins where it enters.
 fn sun_transmittance(p_world: vec3<f32>) -> f32 {
-    let field = field_of(DENSITY_CHANNEL);
+    let field = field_of(SHADOW_CHANNEL);
     let direction = params.sun_direction.xyz;
     let span = field_interval(field, in_field(field, Ray(p_world, direction)), 0.0);
     if (span.x >= span.y) {
         return 1.0;
     }
     let ray = moved(field, Ray(p_world, direction), span.x);
+    if (HAS_EXACT_SHADOWS) {
+        return exact_transmittance(field, ray);
+    }
     let step = params.march.y / length(ray.direction);
     shadow_accessor = new_accessor();
     let lattice = Lattice(step, 0.5, params.march.z / step);
-    let depth = optical_depth(field, ray, span.y - span.x, lattice, params.extinction.x, params.march_rays.z);
+    let depth = optical_depth(field, ray, span.y - span.x, lattice, params.media[0].extinction.x, params.march_rays.z);
     return exp_(-depth);
 }
 

@@ -17,53 +17,13 @@ fn first_voxel(field: u32, ray: Ray) -> VoxelHit {
     return hit;
 }
 
-// The integral of the interpolated field along a ray. Exact but for rounding: in a cell it is a cubic along the ray, which
-// Gauss' rule of two points integrates exactly.
-fn line_integral(field: u32, ray: Ray) -> f32 {
+// The integral of the interpolated field along a ray in the world.
+fn whole_integral(field: u32, ray: Ray) -> f32 {
     let span = field_interval(field, in_field(field, ray), 0.0);
     if (span.x >= span.y) {
         return 0.0;
     }
-    let local = moved(field, ray, span.x);
-    var sum = 0.0;
-    var accessor = new_accessor();
-    var runs = runs_between(field, local, 0.0, span.y - span.x);
-    loop {
-        let found = next_run(&runs, &accessor);
-        if (!found.is_there) {
-            break;
-        }
-        if (!found.run.is_varying) {
-            sum += found.run.value * (found.run.t1 - found.run.t0);
-            continue;
-        }
-        var t = found.run.t0;
-        while (t < found.run.t1) {
-            // From cell to cell, by where the middle of what is left of the brick begins.
-            let corner = floor(ray_at(local, t) / BRICK_SIDE + GAUSS_NUDGE * sign(local.direction)) * BRICK_SIDE;
-            let leaves = interval_in(local, corner, corner + BRICK_SIDE).y;
-            var cells = cells_between(local, t, min(leaves, found.run.t1), corner);
-            let before = t;
-            while (cells.t < cells.end) {
-                let cell = next_cell(&cells);
-                let half = 0.5 * (cell.t1 - cell.t0);
-                if (half <= 0.0) {
-                    continue;
-                }
-                let first = corner + vec3<f32>(cell.local);
-                let c = corners_of(field, &accessor, vec3<i32>(first) + base_voxel(field));
-                let middle = ray_at(local, 0.5 * (cell.t0 + cell.t1)) - first;
-                let apart = local.direction * (half * GAUSS_NODE);
-                sum += half * (lerp8(c, middle - apart) + lerp8(c, middle + apart));
-            }
-            t = cells.t;
-            if (t <= before) {
-                // Rounding: on to the next float.
-                t = bitcast<f32>(bitcast<u32>(max(before, MIN_F32)) + 1u);
-            }
-        }
-    }
-    return sum;
+    return line_integral(field, moved(field, ray, span.x), span.y - span.x);
 }
 
 fn view_colour(hit: VoxelHit, field: u32) -> vec3<f32> {
@@ -95,7 +55,7 @@ fn views(@builtin(global_invocation_id) id: vec3<u32>) {
     let field = field_of(DENSITY_CHANNEL);
     let ray = camera_ray(vec2<f32>(id.xy) + 0.5);
     if (params.counts.z == VIEW_DENSITY) {
-        store(id.xy, vec4<f32>(one_minus_exp_neg(params.extinction.x * line_integral(field, ray))));
+        store(id.xy, vec4<f32>(one_minus_exp_neg(params.media[0].extinction.x * whole_integral(field, ray))));
         return;
     }
     let hit = first_voxel(field, ray);

@@ -44,12 +44,12 @@ fn field_interval(field: u32, ray: LocalRay, shift: f32) -> vec2<f32> {
     if (fields[field].box_first.w == 0) {
         return vec2<f32>(0.0, 0.0);
     }
-    return interval_in(ray, fields[field].bounds_min.xyz - shift, fields[field].bounds_max.xyz - shift);
+    return interval_in(ray, fields[field].bounds_min.xyz - shift - REACH, fields[field].bounds_max.xyz - shift + REACH);
 }
 
 // Where a ray that starts inside leaves the field.
 fn field_exit(field: u32, ray: LocalRay) -> f32 {
-    let far = select(fields[field].bounds_min.xyz, fields[field].bounds_max.xyz, ray.direction >= vec3<f32>(0.0));
+    let far = select(fields[field].bounds_min.xyz - REACH, fields[field].bounds_max.xyz + REACH, ray.direction >= vec3<f32>(0.0));
     let t = (far - ray.origin) * ray.inverse;
     return min_component(select(t, vec3<f32>(MAX_F32), ray.direction == vec3<f32>(0.0)));
 }
@@ -70,6 +70,7 @@ struct Runs {
     sign: vec3<i32>,
     brick_end: vec3<i32>,
     root_leaps_left: u32,
+    leaps_left: u32,
     // What was found and not yet given out: a varying run, one of a value, and a varying one, between these four
     // distances; and how many of them are given out.
     cuts: vec4<f32>,
@@ -107,6 +108,7 @@ fn runs_between(field: u32, ray: LocalRay, t0: f32, t1: f32) -> Runs {
     runs.sign = select(vec3<i32>(-1), vec3<i32>(1), forward);
     runs.brick_end = select(box_first - 1, box_last + 1, forward);
     runs.root_leaps_left = MAX_ROOT_LEAPS;
+    runs.leaps_left = MAX_LEAPS;
     runs.given = 3u;
     aim(&runs);
     return runs;
@@ -151,7 +153,8 @@ fn leap(runs: ptr<function, Runs>, log2_bricks: u32) {
     );
     // The axis of the exit moves by the integers, so that the walk never stands still.
     (*runs).brick = select(within, select(first - 1, last + 1, forward), axis);
-    if (any((*runs).brick < box_first) || any((*runs).brick > box_last)) {
+    (*runs).leaps_left -= 1u;
+    if ((*runs).leaps_left == 0u || any((*runs).brick < box_first) || any((*runs).brick > box_last)) {
         (*runs).t_end = min((*runs).t_end, (*runs).t);
     }
     aim(runs);
@@ -191,8 +194,22 @@ fn leap_to_root_entry(runs: ptr<function, Runs>) {
     aim(runs);
 }
 
+// Bounds of samples whose cell lies in a region around a brick; of those that reach one voxel further, in the brick.
+fn sample_bounds(field: u32, brick: vec3<i32>, region: Region) -> vec2<f32> {
+    var bounds = footprint(field, brick, region);
+    if (IS_WIDE) {
+        var accessor = new_accessor();
+        for (var i = 0; i < 27; i++) {
+            let beside = brick + vec3<i32>(i / 9, i / 3 % 3, i % 3) - 1;
+            let other = footprint(field, beside, region_at(field, &accessor, beside));
+            bounds = vec2<f32>(min(bounds.x, other.x), max(bounds.y, other.y));
+        }
+    }
+    return bounds;
+}
+
 fn pass_region(runs: ptr<function, Runs>, log2_bricks: u32) {
-    if (log2_bricks == 0u) {
+    if (log2_bricks == 0u || IS_WIDE) {
         step_brick(runs);
     } else {
         leap(runs, log2_bricks);
@@ -207,14 +224,14 @@ fn next_segment(runs: ptr<function, Runs>, accessor: ptr<function, Accessor>) ->
     while ((*runs).t < (*runs).t_end) {
         let brick = (*runs).brick;
         let region = region_at((*runs).field, accessor, brick);
-        let bounds = footprint((*runs).field, brick, region);
+        let bounds = sample_bounds((*runs).field, brick, region);
         let t0 = (*runs).t;
         pass_region(runs, region.log2_bricks);
         let t1 = min((*runs).t, (*runs).t_end);
         if (bounds.y > 0.0 && t0 < t1) {
             return Segment(true, t0, t1, bounds.x, bounds.y);
         }
-        if (bounds.y <= 0.0 && region.log2_bricks == LOG2_NODE5_BRICKS) {
+        if (bounds.y <= 0.0 && region.log2_bricks == LOG2_NODE5_BRICKS && !IS_WIDE) {
             leap_to_root_entry(runs);
         }
     }
@@ -270,7 +287,7 @@ fn next_run(runs: ptr<function, Runs>, accessor: ptr<function, Accessor>) -> Fou
     while ((*runs).t < (*runs).t_end) {
         let brick = (*runs).brick;
         let region = region_at((*runs).field, accessor, brick);
-        let bounds = footprint((*runs).field, brick, region);
+        let bounds = sample_bounds((*runs).field, brick, region);
         let t0 = (*runs).t;
         pass_region(runs, region.log2_bricks);
         let t1 = min((*runs).t, (*runs).t_end);
@@ -279,7 +296,7 @@ fn next_run(runs: ptr<function, Runs>, accessor: ptr<function, Accessor>) -> Fou
         }
         if (bounds.x == bounds.y) {
             if (bounds.y == 0.0) {
-                if (region.log2_bricks == LOG2_NODE5_BRICKS) {
+                if (region.log2_bricks == LOG2_NODE5_BRICKS && !IS_WIDE) {
                     leap_to_root_entry(runs);
                 }
                 if (joined.is_there) {
@@ -288,7 +305,7 @@ fn next_run(runs: ptr<function, Runs>, accessor: ptr<function, Accessor>) -> Fou
                 continue;
             }
             wait_with(runs, vec4<f32>(t0, t0, t1, t1), bounds.y);
-        } else if (region.log2_bricks == 0u) {
+        } else if (region.log2_bricks == 0u || IS_WIDE) {
             joined = FoundRun(true, Run(select(t0, joined.run.t0, joined.is_there), t1, true, 0.0));
             continue;
         } else {

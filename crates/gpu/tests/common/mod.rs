@@ -5,6 +5,8 @@
 #![allow(unreachable_pub, reason = "a module of test binaries, not of a library")]
 #![allow(clippy::print_stdout, reason = "the measured errors are worth reading")]
 
+pub mod paths;
+
 use std::convert::Infallible;
 use std::io::Cursor;
 
@@ -26,6 +28,7 @@ use nuage_volume::brick::{BrickSummary, Bricks};
 use nuage_volume::build::{TileSize, TreeBuilder};
 use nuage_volume::channel::{Channel, IndexBox};
 use nuage_volume::format::Asset;
+use nuage_volume::format::contents::FrameGrid;
 use nuage_volume::space::{BRICK_VOXELS, brick_of, voxel_offset};
 
 /// The pictures that are compared.
@@ -40,6 +43,18 @@ pub fn gpu() -> Option<Gpu> {
             None
         }
     }
+}
+
+/// A device that a host opened without any feature, or `None` if there is none.
+pub fn host(required_limits: wgpu::Limits) -> Option<Gpu> {
+    let name = gpu()?.name().to_owned();
+    let instance = wgpu::Instance::new(wgpu::InstanceDescriptor::new_without_display_handle());
+    let adapters = pollster::block_on(instance.enumerate_adapters(wgpu::Backends::PRIMARY));
+    let adapter =
+        adapters.into_iter().find(|adapter| adapter.get_info().name == name).expect("the same device");
+    let descriptor = wgpu::DeviceDescriptor { required_limits, ..Default::default() };
+    let (device, queue) = pollster::block_on(adapter.request_device(&descriptor)).expect("a device");
+    Some(Gpu::from_host(device, queue, name))
 }
 
 /// A channel of the values of `f` at all voxels from `min` to `max`, and of tiles of value 1.
@@ -200,7 +215,14 @@ pub fn packed(frames: &[Vec<Grid>], options: &Options) -> Asset {
 pub fn unpacked(asset: &Asset, frame: usize, name: &str) -> Channel {
     let (grids, _) = unpack_frame(asset, frame).expect("a frame");
     let grid = grids.into_iter().find(|grid| grid.name == name).expect("the grid");
-    nuage_pipeline::import::import(grid).expect("a linear transform").0
+    let mut channel = nuage_pipeline::import::import(grid).expect("a linear transform").0;
+    // BC4 has no exact zero beside what it blends: what spills beyond the source's box would move where rays begin to step.
+    let contents = asset.contents();
+    let is_same = |grid: &&FrameGrid| contents.channels[grid.channel as usize].name == name;
+    let [min, max] =
+        contents.frames[frame].grids.iter().find(is_same).and_then(|grid| grid.active_box).expect("voxels");
+    channel.active_box = Some(IndexBox { min: IVec3::from_array(min), max: IVec3::from_array(max) });
+    channel
 }
 
 /// A renderer of pictures to be compared. Keep it: its pipelines take seconds on a device in software.

@@ -3,12 +3,12 @@
 use fearless_simd::{Level, Simd, dispatch, f32x16, i32x16, mask32x16, prelude::*};
 use nuage_volume::brick::Bricks;
 
+use super::ahead::{Asked, ahead_of, ask_for_block, ask_for_brick};
 use super::{Lanes, Packet, RAYS, Stretch, bricks_of, each_ray, interpolate, to_int};
 use crate::blocks::Blocks;
 use crate::camera::Ray;
 use crate::depth::{self, NEAREST_SHIFT, Stored};
 use crate::filter::Filter;
-use crate::gather::prefetch;
 use crate::simd::level;
 use crate::traverse::{Field, Reader};
 use crate::walk::{SPECIAL, Sight};
@@ -129,17 +129,12 @@ fn places_of<S: Simd>(simd: S, cells: i32x16<S>, voxels: [i32x16<S>; 3]) -> i32x
 #[inline(always)]
 fn integrate_voxels<S: Simd, V: Stored>(lanes: &Lanes<'_, S>, values: &[V]) -> [f32; RAYS] {
     let (none, mut depth) = (mask32x16::splat(lanes.simd, false), lanes.splat(0.0));
-    let [x, y, z] = lanes.inverse;
-    // As far as eight layers of voxels.
-    let ahead = x.abs().min(y.abs()).min(z.abs()) * 8.0;
-    let mut turn = 0_u32;
+    let ahead = ahead_of(lanes);
+    let mut asked = Asked::new();
     lanes.each_stretch(
         #[inline(always)]
         |stretch| {
-            if turn.is_multiple_of(LOOK_AHEAD_EACH) {
-                look_ahead(lanes, values, stretch.t + ahead);
-            }
-            turn = turn.wrapping_add(1);
+            asked.look_ahead(lanes, stretch.t + ahead, |brick| ask_for_brick(values, brick));
             // Those that have left stand in an empty cell.
             depth +=
                 values_of(lanes, values, stretch.cells, to_int(stretch.voxels)) * (stretch.end - stretch.t);
@@ -156,9 +151,11 @@ fn integrate_cells<'a, S: Simd>(
     blocks: &mut Blocks<'a>,
 ) -> [f32; RAYS] {
     let (none, mut depth) = (mask32x16::splat(lanes.simd, false), lanes.splat(0.0));
+    let (ahead, mut asked) = (ahead_of(lanes), Asked::new());
     lanes.each_stretch(
         #[inline(always)]
         |stretch| {
+            asked.look_ahead(lanes, stretch.t + ahead, |entry| ask_for_block(blocks, entry));
             if stretch.is_filled().any_true() {
                 let Stretch { t, end, voxels, cells, .. } = *stretch;
                 let length = end - t;
@@ -188,9 +185,11 @@ fn sample_cells<'a, S: Simd>(
     let (per_step, loss) = (one / steps, steps * extinction);
     let none = mask32x16::splat(lanes.simd, false);
     let (mut number, mut passes) = (zero, one);
+    let (ahead, mut asked) = (ahead_of(lanes), Asked::new());
     lanes.each_stretch(
         #[inline(always)]
         |stretch| {
+            asked.look_ahead(lanes, stretch.t + ahead, |entry| ask_for_block(blocks, entry));
             let Stretch { end, voxels, cells, .. } = *stretch;
             let mut t_sample = number * steps;
             let mut inside = stretch.is_filled() & t_sample.simd_lt(end);
@@ -226,8 +225,9 @@ fn sample_voxels<S: Simd, V: Stored>(
     extinction: f32,
 ) -> [f32; RAYS] {
     let (one, per_step, loss) = (lanes.splat(1.0), lanes.splat(1.0) / steps, steps * extinction);
-    let (mut number, mut passes) = (lanes.splat(0.0), one);
-    for turn in 0_u32.. {
+    let (mut number, mut passes, mut asked) = (lanes.splat(0.0), one, Asked::new());
+    let ahead = ahead_of(lanes);
+    loop {
         let t = number * steps;
         let active = t.simd_lt(lanes.ends);
         if !active.any_true() {
@@ -239,9 +239,7 @@ fn sample_voxels<S: Simd, V: Stored>(
         let is_empty = cells.simd_lt(0);
         number += one;
         if !is_empty.all_true() {
-            if turn.is_multiple_of(LOOK_AHEAD_EACH) {
-                look_ahead(lanes, values, t + steps * (2 * LOOK_AHEAD_EACH) as f32);
-            }
+            asked.look_ahead(lanes, t + ahead, |brick| ask_for_brick(values, brick));
             passes *= one - values_of(lanes, values, cells, to_int(position)) * loss;
         }
         if (is_empty & active).any_true() {
@@ -251,16 +249,4 @@ fn sample_voxels<S: Simd, V: Stored>(
         }
     }
     passes.to_array()
-}
-
-/// Each so many turns, the lines of the cache are asked for in which the values stand of about as many turns later. A brick comes
-/// into the caches while the one before it is worked on.
-const LOOK_AHEAD_EACH: u32 = 8;
-
-/// Asks for the values at `t`.
-#[inline(always)]
-fn look_ahead<S: Simd, V>(lanes: &Lanes<'_, S>, values: &[V], t: f32x16<S>) {
-    let position = lanes.at(t);
-    let cells = lanes.cells(bricks_of(position), t.simd_lt(lanes.ends));
-    prefetch(values, places_of(lanes.simd, cells, to_int(position)));
 }

@@ -20,6 +20,7 @@ use crate::simd::each_lane;
 use crate::traverse::Field;
 use crate::walk::{BORDER, BrickMap, SPECIAL};
 
+mod ahead;
 mod lines;
 mod surfaces;
 mod tracks;

@@ -6,7 +6,8 @@ use glam::Vec3;
 use super::{Lanes, Packet, RAYS, bricks_of, each_bit, each_ray};
 use crate::blocks::Blocks;
 use crate::camera::Ray;
-use crate::depth::interpolate;
+use crate::depth::{corners_around, interpolate};
+use crate::gather::prefetch;
 use crate::math::ln;
 use crate::simd::level;
 use crate::track;
@@ -98,17 +99,26 @@ fn collide<'a, S: Simd>(
             let (places, tops) = (places.to_array(), tops.to_array());
             let (mut depths, mut new_ends) = (left.to_array(), ends.to_array());
             let at = t.to_array();
-            // All values before the first is asked for: they come from memory side by side.
+            let cells =
+                each_ray!(|lane| lanes.map.cells().get(places[lane] as usize).copied().unwrap_or(SPECIAL));
+            let corner_of = |lane: usize| Vec3::new(place[0][lane], place[1][lane], place[2][lane]) * 8.0;
+            let position_of =
+                |lane: usize| Vec3::new(position[0][lane], position[1][lane], position[2][lane]);
+            // All values are asked for before the first is used: they come from memory side by side.
+            each_bit(collided, |lane| {
+                if let Some(block) = blocks.known(cells[lane] as usize) {
+                    prefetch(corners_around(block, position_of(lane) - corner_of(lane)));
+                }
+            });
             let mut values = [f32::INFINITY; RAYS];
             each_bit(collided, |lane| {
-                let corner = Vec3::new(place[0][lane], place[1][lane], place[2][lane]) * 8.0;
-                let block = match lanes.map.cells().get(places[lane] as usize).copied().unwrap_or(SPECIAL) {
+                let corner = corner_of(lane);
+                let block = match cells[lane] {
                     SPECIAL.. => return,
                     BORDER => blocks.of_tile(field.brick_at(corner)),
                     entry => blocks.of_entry(entry as usize, || field.brick_at(corner)),
                 };
-                let position = Vec3::new(position[0][lane], position[1][lane], position[2][lane]);
-                values[lane] = interpolate(block, position - corner);
+                values[lane] = interpolate(block, position_of(lane) - corner);
             });
             each_bit(collided, |lane| {
                 let is_real = values[lane] == f32::INFINITY || random(lane) * tops[lane] < values[lane];

@@ -1,0 +1,56 @@
+// Line integrals: nuage_render::depth.
+
+// The integral of the interpolated field along a ray from 0 to `end`. Exact but for rounding: in a cell it is a cubic along the ray, which
+// Gauss' rule of two points integrates exactly.
+fn line_integral(field: u32, local: LocalRay, end: f32) -> f32 {
+    var sum = 0.0;
+    var accessor = new_accessor();
+    var runs = runs_between(field, local, 0.0, end);
+    loop {
+        let found = next_run(&runs, &accessor);
+        if (!found.is_there) {
+            break;
+        }
+        if (!found.run.is_varying) {
+            sum += found.run.value * (found.run.t1 - found.run.t0);
+            continue;
+        }
+        var t = found.run.t0;
+        while (t < found.run.t1) {
+            // From cell to cell, by where the middle of what is left of the brick begins.
+            let corner = floor(ray_at(local, t) / BRICK_SIDE + GAUSS_NUDGE * sign(local.direction)) * BRICK_SIDE;
+            let leaves = interval_in(local, corner, corner + BRICK_SIDE).y;
+            var cells = cells_between(local, t, min(leaves, found.run.t1), corner);
+            let before = t;
+            while (cells.t < cells.end) {
+                let cell = next_cell(&cells);
+                let half = 0.5 * (cell.t1 - cell.t0);
+                if (half <= 0.0) {
+                    continue;
+                }
+                let first = corner + vec3<f32>(cell.local);
+                let c = corners_of(field, &accessor, vec3<i32>(first) + base_voxel(field));
+                let middle = ray_at(local, 0.5 * (cell.t0 + cell.t1)) - first;
+                let apart = local.direction * (half * GAUSS_NODE);
+                sum += half * (lerp8(c, middle - apart) + lerp8(c, middle + apart));
+            }
+            t = cells.t;
+            if (t <= before) {
+                // Rounding: on to the next float.
+                t = bitcast<f32>(bitcast<u32>(max(before, MIN_F32)) + 1u);
+            }
+        }
+    }
+    return sum;
+}
+
+// The same of the nearest voxels, each a box around its place.
+fn voxel_integral(field: u32, local: LocalRay) -> f32 {
+    let ray = local_ray(local.origin + 0.5, local.direction);
+    let span = field_interval(field, ray, 0.0);
+    var sum = 0.0;
+    if (span.x < span.y) {
+        add_voxels(field, ray, span.x, span.y, &sum);
+    }
+    return sum;
+}
