@@ -294,7 +294,8 @@ impl Stages {
             pixels,
             if self.measures.accumulate { self.number } else { 0 },
         ];
-        let corners = volume.place(frame, look.density_channel()).map_or([DVec3::ZERO; 8], Place::world_corners);
+        let corners =
+            volume.place(frame, look.density_channel()).map_or([DVec3::ZERO; 8], Place::world_corners);
         let [nearest, furthest] = views::distances(&corners, &look.camera);
         params.view = [nearest as f32, furthest as f32, 0.0, 0.0];
         let is_wanted = self.measures.light_volume && !look.lights.is_empty();
