@@ -12,6 +12,7 @@
 //! What does not live here: pipelines and the order of passes ([`crate::renderer`]).
 
 use glam::DVec3;
+use nuage_render::filter::Lookup;
 use nuage_render::march::Quality;
 use nuage_render::views;
 
@@ -39,7 +40,8 @@ pub struct RealTime {
     pub accumulate: bool,
     /// The milliseconds that a picture may take on the device, or `None` for no such bound: while pictures take longer, steps
     /// are made longer and shadow rays fewer, and then a quarter of the pixels is marched. By timestamps of the device; where
-    /// it has none, a host says what pictures took ([`crate::renderer::Renderer::took`]).
+    /// it has none or is one in software, [`crate::renderer::Renderer::run`] looks at the clock, and a host that records says
+    /// what pictures took ([`crate::renderer::Renderer::took`]).
     pub budget_ms: Option<f32>,
 }
 
@@ -63,8 +65,17 @@ const COUNT_MOVED: f32 = 16.0;
 /// … and where the medium or its light is another.
 const COUNT_CHANGED: f32 = 2.0;
 
-/// What a filled light volume was filled from.
-type Filled = (Content, [[f32; 4]; 6], u32, Features);
+/// What a light volume was filled from.
+#[derive(Debug, PartialEq)]
+struct Filled {
+    volume: Content,
+    frame: u32,
+    /// The channel that shadow rays read, and how.
+    channel: u32,
+    lookup: Lookup,
+    /// Where it lies, and what makes depths of densities.
+    lattice: [[f32; 4]; 6],
+}
 
 /// Buffers and textures of the stages, and what goes from one picture to the next.
 #[derive(Debug)]
@@ -268,7 +279,7 @@ impl Stages {
 
     /// What a host measured of the last picture, for a device without timestamps.
     pub(crate) fn told(&mut self, took_ms: f32) {
-        if self.timer.is_none() {
+        if self.timer.is_none() && self.measures.budget_ms.is_some() {
             self.took(self.effort, took_ms);
         }
     }
@@ -303,9 +314,10 @@ impl Stages {
         place.is_some_and(|place| light_volume::lay(params, place).is_some())
     }
 
-    /// Ends what pictures have in common.
+    /// Ends what pictures have in common: the next one is as the first.
     pub(crate) fn forget(&mut self) {
         self.last = None;
+        self.number = 0;
     }
 
     /// What the next picture is told of the one before, and the stages that it goes through.
@@ -326,7 +338,13 @@ impl Stages {
                 params.media[0].extinction,
                 [march_rays[2], march_rays[3], 0.0, 0.0],
             ];
-            let filled = (volume.content(), lattice, params.size[2], *features);
+            let filled = Filled {
+                volume: volume.content(),
+                frame: params.size[2],
+                channel: features.density_channels[1],
+                lookup: features.lookup,
+                lattice,
+            };
             if self.filled.as_ref() != Some(&filled) {
                 stages.push(Source::LightVolume);
                 self.filled = Some(filled);

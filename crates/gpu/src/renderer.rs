@@ -6,6 +6,7 @@
 use std::collections::HashMap;
 use std::ops::Range;
 use std::sync::Arc;
+use std::time::Instant;
 
 use glam::DMat4;
 use nuage_render::envmap::EnvironmentMap;
@@ -202,11 +203,14 @@ impl Renderer {
             self.depth = Some(self.gpu.guarded(|| self.gpu.device().create_bind_group(&descriptor))?);
         }
         let key = (source, features);
-        let following = [Source::LightVolume, Source::Upsample, Source::Accumulate];
-        for source in [source].into_iter().chain(following.into_iter().filter(|_| is_real_time)) {
-            if !self.pipelines.contains_key(&(source, features)) {
-                let pipeline = self.pipeline(volume, source, &features)?;
-                self.pipelines.insert((source, features), pipeline);
+        let light_volume = has_light_volume.then_some(Source::LightVolume);
+        // Both, though a budget may never ask for the first: no picture is to wait for it then.
+        let following = [Source::Upsample, Source::Accumulate].into_iter().filter(|_| is_real_time);
+        for source in [source].into_iter().chain(light_volume).chain(following) {
+            let key = (source, features.of(source));
+            if !self.pipelines.contains_key(&key) {
+                let pipeline = self.pipeline(volume, source, &key.1)?;
+                self.pipelines.insert(key, pipeline);
             }
         }
         self.bind_sky(look)?;
@@ -388,7 +392,7 @@ impl Renderer {
         let stages = self.stages.as_ref().filter(|_| features.is_real_time);
         let timer = stages.and_then(Stages::timer);
         for (i, source) in sources.iter().enumerate() {
-            let pipeline = self.pipelines.get(&(*source, features)).ok_or_else(nothing)?;
+            let pipeline = self.pipelines.get(&(*source, features.of(*source))).ok_or_else(nothing)?;
             let timestamp_writes = timer.map(|timer| timer.writes(i == 0, i + 1 == sources.len()));
             let descriptor = wgpu::ComputePassDescriptor {
                 label: Some(source.entry_point()),
@@ -529,8 +533,13 @@ impl Renderer {
         let mut encoder =
             self.gpu.device().create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
         self.record(&mut encoder, volume)?;
+        let start = Instant::now();
         self.gpu.guarded(|| self.gpu.queue().submit([encoder.finish()]))?;
-        self.gpu.wait()
+        self.gpu.wait()?;
+        if self.prepared.as_ref().is_some_and(|prepared| prepared.key.1.is_real_time) {
+            self.took(start.elapsed().as_secs_f32() * 1e3);
+        }
+        Ok(())
     }
 
     /// The picture, row by row: colour times opacity, and opacity; of paths their mean.
@@ -600,6 +609,56 @@ fn check_frame(volume: &Volume, frame: usize) -> Result<(), GpuError> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::arrays::Arrays;
+    use crate::real_time::RealTime;
+    use glam::Vec3;
+    use nuage_render::light::Light;
+    use nuage_render::march::Quality;
+
+    /// Filled when the light, the medium's extinction, the frame or what the volume holds is another, and else not: whoever
+    /// looks, however finely, and whatever colour it has.
+    #[test]
+    fn light_volumes_are_filled_when_light_changes() {
+        let Some(gpu) = crate::twins::gpu() else { return };
+        let channel = crate::hostile::block(2);
+        let arrays = Arrays::of_channels(&[&channel]).expect("arrays");
+        let mut volume = Volume::new(&gpu, &arrays).expect("a volume");
+        let mut look = crate::hostile::look();
+        let mut renderer = Renderer::new(&gpu, [16, 9]).expect("a renderer");
+        let quality = Quality::default();
+        let mut fills = |volume: &Volume, look: &Look, quality: Quality, frame: usize, has_depth: bool| {
+            let pass = Pass::RealTime { quality, measures: RealTime::default() };
+            let mut params = look.params(volume, &pass, [16, 9], frame).expect("parameters");
+            let stages = renderer.stages().expect("stages");
+            stages.ask(&gpu, quality, RealTime::default()).expect("a quality");
+            assert!(stages.settle(&mut params, volume, look, frame), "no light volume");
+            let features = features(volume, look, &pass, Source::March, has_depth);
+            let features = Features { has_light_volume: true, ..features };
+            stages.advance(&mut params, volume, &features).contains(&Source::LightVolume)
+        };
+        assert!(fills(&volume, &look, quality, 0, false), "the first");
+        assert!(!fills(&volume, &look, quality, 0, false), "the same");
+        look.camera.origin.x += 1.0;
+        look.media[0].albedo = [0.5; 3];
+        look.sky = Sky::Constant([0.0; 3]);
+        let finer = Quality { step_voxels: 0.5, sky_rays: 3, ..quality };
+        assert!(!fills(&volume, &look, finer, 0, true), "another view, colour, sky and step");
+        if let Some(Light::Sun(sun)) = look.lights.first_mut() {
+            sun.irradiance = [7.0; 3];
+        }
+        assert!(!fills(&volume, &look, quality, 0, false), "a brighter sun");
+        if let Some(Light::Sun(sun)) = look.lights.first_mut() {
+            sun.direction_to = Vec3::X;
+        }
+        assert!(fills(&volume, &look, quality, 0, false), "another sun");
+        look.media[0].extinction = [4.0; 3];
+        assert!(fills(&volume, &look, quality, 0, false), "another extinction");
+        assert!(!fills(&volume, &look, quality, 0, false), "the same again");
+        volume.fill(&gpu, &arrays).expect("as much room");
+        assert!(fills(&volume, &look, quality, 0, false), "a volume that was filled anew");
+        let other = Volume::new(&gpu, &arrays).expect("a volume");
+        assert!(fills(&other, &look, quality, 0, false), "another volume");
+    }
 
     #[test]
     fn what_changes_is_found() {

@@ -109,6 +109,16 @@ impl Features {
         encodes_srgb: true,
     };
 
+    /// What matters to a shader: all, but to those that read nothing of the volume.
+    pub(crate) fn of(self, source: Source) -> Features {
+        match source {
+            Source::Upsample | Source::Accumulate => {
+                Features { has_depth: self.has_depth, is_real_time: self.is_real_time, ..Features::BARE }
+            }
+            _ => self,
+        }
+    }
+
     /// Whether there is one grid and nothing else.
     fn is_one_grid(&self) -> bool {
         self.media == 1 && !self.has_solids
@@ -564,6 +574,7 @@ fn prelude(features: &Features) -> String {
     p.f("GAUSS_NUDGE", 1e-5);
     p.f("LIT_PIECE_DEPTH", march::LIT_PIECE_DEPTH);
     p.f("LIT_PIECE_VOXELS", march::LIT_PIECE_VOXELS);
+    p.f("MOST_PIECES", march::MOST_PIECES);
     p.f("GROUP_VOXELS", march::GROUP_VOXELS);
     p.f("FAINT_GROUP", march::FAINT_GROUP);
     p.f("FAINT_GROUP_VOXELS", march::FAINT_GROUP_VOXELS);

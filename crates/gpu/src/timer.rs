@@ -29,12 +29,14 @@ pub(crate) struct Timer {
 }
 
 impl Timer {
-    /// `None` if the device has no timestamps.
+    /// `None` if the device has no timestamps, or none that mean something: one in software works when it comes to it, not
+    /// between what it writes.
     ///
     /// # Errors
     /// If it fails.
     pub(crate) fn new(gpu: &Gpu) -> Result<Option<Timer>, GpuError> {
-        if !gpu.device().features().contains(wgpu::Features::TIMESTAMP_QUERY) {
+        let is_software = gpu.device().adapter_info().device_type == wgpu::DeviceType::Cpu;
+        if is_software || !gpu.device().features().contains(wgpu::Features::TIMESTAMP_QUERY) {
             return Ok(None);
         }
         let descriptor =

@@ -4,7 +4,7 @@
 
 mod common;
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
 use common::{gpu, lit, packed, picture, uploaded};
 use glam::{DVec3, IVec3, Vec3};
@@ -24,6 +24,7 @@ use nuage_render::march::Quality;
 use nuage_render::traverse::Field;
 use nuage_vdb::{AnyTree, Map};
 use nuage_volume::channel::Channel;
+use nuage_volume::codec::Codec;
 
 /// As a picture is without any measure.
 const NONE: RealTime =
@@ -44,9 +45,20 @@ const FINE: Quality = Quality {
     lookup: nuage_render::filter::Lookup::Trilinear,
 };
 
-/// Small, since dozens of pictures are made.
-fn small(gpu: &Gpu) -> Renderer {
-    Renderer::new(gpu, [48, 27]).expect("a renderer")
+/// Runs with a renderer of small pictures, since dozens are made. All tests share one, whose pipelines take seconds on a
+/// device in software; pictures of other passes end what those that follow each other have in common.
+fn with_renderer(test: impl FnOnce(&Gpu, &mut Renderer)) {
+    static SHARED: Mutex<Option<(Gpu, Renderer)>> = Mutex::new(None);
+    let mut shared = SHARED.lock().unwrap_or_else(PoisonError::into_inner);
+    if shared.is_none() {
+        *shared = gpu().map(|gpu| {
+            let renderer = Renderer::new(&gpu, [48, 27]).expect("a renderer");
+            (gpu, renderer)
+        });
+    }
+    if let Some((gpu, renderer)) = shared.as_mut() {
+        test(gpu, renderer);
+    }
 }
 
 /// A cloud of 36 voxels across.
@@ -100,7 +112,9 @@ fn two_frames(gpu: &Gpu) -> Volume {
         let aside = matrix[0].map(|x| 20.0 * x);
         matrix[3].iter_mut().zip(aside).take(3).for_each(|(x, aside)| *x += aside);
     }
-    let asset = packed(&[vec![first], vec![second]], &Options::default());
+    let codec = Some(Codec::F32);
+    let options = Options { codec, max_error: None, psnr: None, ..Options::default() };
+    let asset = packed(&[vec![first], vec![second]], &options);
     let wanted = [Wanted { name: "density".to_owned(), meaning: Meaning::Density }];
     Volume::new(gpu, &Arrays::of_asset(&asset, &wanted, 0..2, Bricks::AsStored).expect("arrays"))
         .expect("a volume")
@@ -114,243 +128,263 @@ fn look_of_frames() -> Look {
 }
 
 /// Without a measure nothing changes but where steps begin; light from the light volume is close to that of shadow rays, and
-/// far from what there is without shadows. Another frame fills it anew.
+/// far from that of another sun. Another sun and another frame fill it anew.
 #[test]
 fn a_light_volume_stands_for_shadow_rays() {
-    let Some(gpu) = gpu() else { return };
-    let channel = puff();
-    let (volume, scene) = (uploaded(&gpu, &[&channel]), lit(&channel));
-    let mut look = Look::of_scene(&scene).expect("a look");
-    let mut renderer = small(&gpu);
-    let quality = Quality { sky_rays: 0, ..FINE };
-    let rays = shown(&mut renderer, &volume, &look, quality, NONE);
-    let alone = picture(&mut renderer, &volume, &look, &Pass::March(quality), 0);
-    let measures = RealTime { light_volume: true, ..NONE };
-    let cached = shown(&mut renderer, &volume, &look, quality, measures);
-    let [mean, deviation] = errors(&cached, &rays);
-    let [mean_alone, deviation_alone] = errors(&alone, &rays);
-    println!(
-        "light volume: mean {mean:.2e}, deviation {deviation:.2e}; of steps that begin elsewhere {mean_alone:.2e}, {deviation_alone:.2e}"
-    );
-    assert!(mean < 1.5e-2 && deviation < 2.5e-2, "{mean} {deviation}");
-    assert!(mean_alone < 3e-3 && deviation_alone > 0.0, "{mean_alone} {deviation_alone}");
-    // Light from elsewhere fills it anew.
-    if let Some(Light::Sun(sun)) = look.lights.first_mut() {
-        sun.direction_to = Vec3::new(-0.6, 0.0, 0.8);
-    }
-    let turned = shown(&mut renderer, &volume, &look, quality, measures);
-    let rays = shown(&mut renderer, &volume, &look, quality, NONE);
-    let [mean, deviation] = errors(&turned, &rays);
-    println!("from elsewhere: mean {mean:.2e}, deviation {deviation:.2e}");
-    assert!(
-        mean < 1.5e-2 && deviation < 2.5e-2 && errors(&cached, &rays)[0] > 2.0 * mean,
-        "{mean} {deviation}"
-    );
+    with_renderer(|gpu, renderer| {
+        let channel = puff();
+        let (volume, scene) = (uploaded(gpu, &[&channel]), lit(&channel));
+        let mut look = Look::of_scene(&scene).expect("a look");
+        let quality = Quality { sky_rays: 0, ..FINE };
+        let rays = shown(renderer, &volume, &look, quality, NONE);
+        let alone = picture(renderer, &volume, &look, &Pass::March(quality), 0);
+        let measures = RealTime { light_volume: true, ..NONE };
+        let cached = shown(renderer, &volume, &look, quality, measures);
+        let [mean, deviation] = errors(&cached, &rays);
+        let [mean_alone, deviation_alone] = errors(&alone, &rays);
+        println!(
+            "light volume: mean {mean:.2e}, deviation {deviation:.2e}; of steps that begin elsewhere {mean_alone:.2e}, {deviation_alone:.2e}"
+        );
+        assert!(mean < 1.5e-2 && deviation < 2.5e-2, "{mean} {deviation}");
+        assert!(mean_alone < 3e-3 && deviation_alone > 0.0, "{mean_alone} {deviation_alone}");
+        // Light from elsewhere fills it anew.
+        if let Some(Light::Sun(sun)) = look.lights.first_mut() {
+            sun.direction_to = Vec3::new(-0.6, 0.0, 0.8);
+        }
+        let turned = shown(renderer, &volume, &look, quality, measures);
+        let rays = shown(renderer, &volume, &look, quality, NONE);
+        let [mean, deviation] = errors(&turned, &rays);
+        println!("from elsewhere: mean {mean:.2e}, deviation {deviation:.2e}");
+        assert!(
+            mean < 1.5e-2 && deviation < 2.5e-2 && errors(&cached, &rays)[0] > 2.0 * mean,
+            "{mean} {deviation}"
+        );
 
-    let (volume, look) = (two_frames(&gpu), look_of_frames());
-    let pass = Pass::RealTime { quality, measures };
-    renderer.prepare(&volume, &look, &pass, 0, None).expect("a pass");
-    renderer.run(&volume).expect("a run");
-    renderer.set_frame(&volume, 1).expect("a frame");
-    renderer.run(&volume).expect("a run");
-    let switched = renderer.pixels().expect("pixels");
-    let fresh = picture(&mut small(&gpu), &volume, &look, &pass, 1);
-    assert_eq!(switched, fresh);
+        let (volume, look) = (two_frames(gpu), look_of_frames());
+        let pass = Pass::RealTime { quality, measures };
+        let other = picture(renderer, &volume, &look, &pass, 0);
+        renderer.set_frame(&volume, 1).expect("a frame");
+        renderer.run(&volume).expect("a run");
+        let switched = renderer.pixels().expect("pixels");
+        // Filled for another volume in between.
+        picture(renderer, &uploaded(gpu, &[&channel]), &look, &pass, 0);
+        let fresh = picture(renderer, &volume, &look, &pass, 1);
+        assert!(switched == fresh && switched != other, "a light volume of another frame");
+    });
 }
 
 /// A still camera: pictures of one ray to the sky each come to be the one of many, as the root of their number, and those of
 /// a quarter of the pixels too.
 #[test]
 fn accumulated_pictures_converge() {
-    let Some(gpu) = gpu() else { return };
-    let channel = puff();
-    let (volume, scene) = (uploaded(&gpu, &[&channel]), lit(&channel));
-    let look = Look::of_scene(&scene).expect("a look");
-    let mut renderer = small(&gpu);
-    let reference = picture(&mut renderer, &volume, &look, &Pass::March(MANY), 0);
-    for half_resolution in [false, true] {
-        let measures = RealTime { accumulate: true, half_resolution, ..NONE };
-        let mut renderer = small(&gpu);
-        let first = shown(&mut renderer, &volume, &look, COARSE, measures);
-        let mut last = Vec::new();
-        for _ in 1..24 {
-            last = shown(&mut renderer, &volume, &look, COARSE, measures);
+    with_renderer(|gpu, renderer| {
+        let channel = puff();
+        let (volume, scene) = (uploaded(gpu, &[&channel]), lit(&channel));
+        let look = Look::of_scene(&scene).expect("a look");
+        for half_resolution in [false, true] {
+            let reference = picture(renderer, &volume, &look, &Pass::March(MANY), 0);
+            let measures = RealTime { accumulate: true, half_resolution, ..NONE };
+            let first = shown(renderer, &volume, &look, COARSE, measures);
+            let mut last = Vec::new();
+            for _ in 1..16 {
+                last = shown(renderer, &volume, &look, COARSE, measures);
+            }
+            let ([_, before], [mean, after]) = (errors(&first, &reference), errors(&last, &reference));
+            println!(
+                "half {half_resolution}: deviation {before:.2e} of the first, {after:.2e} and mean {mean:.2e} of the last"
+            );
+            assert!(after < 0.4 * before, "{before} {after}");
         }
-        let ([_, before], [mean, after]) = (errors(&first, &reference), errors(&last, &reference));
-        println!(
-            "half {half_resolution}: deviation {before:.2e} of the first, {after:.2e} and mean {mean:.2e} of the last"
-        );
-        assert!(after < 0.4 * before, "{before} {after}");
-    }
+    });
 }
 
 /// Nothing of a frame stays when another is shown: where that is empty there is nothing at once, and elsewhere pictures are as
 /// near to its own as if there had never been another. The same goes for a camera that leaps.
 #[test]
 fn nothing_stays_that_is_gone() {
-    let Some(gpu) = gpu() else { return };
-    let (volume, mut look) = (two_frames(&gpu), look_of_frames());
-    let measures = RealTime { accumulate: true, ..NONE };
-    let pass = Pass::RealTime { quality: COARSE, measures };
-    let mut renderer = small(&gpu);
-    let old = picture(&mut renderer, &volume, &look, &Pass::March(MANY), 0);
-    let new = picture(&mut renderer, &volume, &look, &Pass::March(MANY), 1);
-    // Where pixels around show something, a mean is held to that.
-    let is_clear = |i: usize| {
-        let [x, y] = [(i % 48) as i32, (i / 48) as i32];
-        common::boxed(IVec3::new(x - 1, y - 1, 0), IVec3::new(x + 1, y + 1, 0)).all(|p| {
-            new.get((p.y.clamp(0, 26) * 48 + p.x.clamp(0, 47)) as usize).is_some_and(|p| p[3] == 0.0)
-        })
-    };
-    let gone: Vec<usize> = (0..new.len()).filter(|i| old[*i][3] > 0.1 && is_clear(*i)).collect();
-    assert!(gone.len() > 100, "{}", gone.len());
-    (0..6).for_each(|_| drop(picture(&mut renderer, &volume, &look, &pass, 0)));
-    renderer.set_frame(&volume, 1).expect("a frame");
-    let mut fresh = small(&gpu);
-    for number in 1..=3 {
-        renderer.run(&volume).expect("a run");
-        let pixels = renderer.pixels().expect("pixels");
-        let ghosts = gone.iter().filter(|i| pixels[**i] != [0.0; 4]).count();
-        let [_, deviation] = errors(&pixels, &new);
-        let [_, alone] = errors(&picture(&mut fresh, &volume, &look, &pass, 1), &new);
-        println!(
-            "{number} after: {ghosts} of {} ghosts, deviation {deviation:.2e} and {alone:.2e} alone",
-            gone.len()
-        );
-        assert!(ghosts == 0 && deviation < 1.2 * alone, "{ghosts} of {}, {deviation} {alone}", gone.len());
-    }
-    look.camera.origin += look.camera.right * 0.1 * look.camera.origin.length();
-    let new = picture(&mut small(&gpu), &volume, &look, &Pass::March(MANY), 1);
-    let mut fresh = small(&gpu);
-    for number in 1..=2 {
-        let [_, deviation] = errors(&picture(&mut renderer, &volume, &look, &pass, 1), &new);
-        let [_, alone] = errors(&picture(&mut fresh, &volume, &look, &pass, 1), &new);
-        println!("{number} after a leap: deviation {deviation:.2e} and {alone:.2e} alone");
-        assert!(deviation < 1.2 * alone, "{deviation} {alone}");
-    }
+    with_renderer(|gpu, renderer| {
+        let (volume, mut look) = (two_frames(gpu), look_of_frames());
+        let pass = Pass::RealTime { quality: COARSE, measures: RealTime { accumulate: true, ..NONE } };
+        let old = picture(renderer, &volume, &look, &Pass::March(MANY), 0);
+        let new = picture(renderer, &volume, &look, &Pass::March(MANY), 1);
+        // Where pixels around show something, a mean is held to that.
+        let is_clear = |i: usize| {
+            let [x, y] = [(i % 48) as i32, (i / 48) as i32];
+            common::boxed(IVec3::new(x - 1, y - 1, 0), IVec3::new(x + 1, y + 1, 0)).all(|p| {
+                new.get((p.y.clamp(0, 26) * 48 + p.x.clamp(0, 47)) as usize).is_some_and(|p| p[3] == 0.0)
+            })
+        };
+        let gone: Vec<usize> = (0..new.len()).filter(|i| old[*i][3] > 0.1 && is_clear(*i)).collect();
+        assert!(gone.len() > 100, "{}", gone.len());
+        let alone = [0; 3].map(|_| errors(&picture(renderer, &volume, &look, &pass, 1), &new)[1]);
+        renderer.prepare(&volume, &look, &Pass::Hits, 0, None).expect("a pass");
+        (0..4).for_each(|_| drop(picture(renderer, &volume, &look, &pass, 0)));
+        renderer.set_frame(&volume, 1).expect("a frame");
+        for alone in alone {
+            renderer.run(&volume).expect("a run");
+            let pixels = renderer.pixels().expect("pixels");
+            let ghosts = gone.iter().filter(|i| pixels[**i] != [0.0; 4]).count();
+            let [_, deviation] = errors(&pixels, &new);
+            println!("{ghosts} of {} ghosts, deviation {deviation:.2e} and {alone:.2e} alone", gone.len());
+            assert!(
+                ghosts == 0 && deviation < 1.2 * alone,
+                "{ghosts} of {}, {deviation} {alone}",
+                gone.len()
+            );
+        }
+        look.camera.origin += look.camera.right * 0.1 * look.camera.origin.length();
+        let leapt = [0; 2].map(|_| picture(renderer, &volume, &look, &pass, 1));
+        let new = picture(renderer, &volume, &look, &Pass::March(MANY), 1);
+        for leapt in leapt {
+            let [_, deviation] = errors(&leapt, &new);
+            let [_, alone] = errors(&picture(renderer, &volume, &look, &pass, 1), &new);
+            println!("after a leap: deviation {deviation:.2e} and {alone:.2e} alone");
+            assert!(deviation < 1.2 * alone, "{deviation} {alone}");
+        }
+    });
 }
 
 /// What a camera sees that goes on moving is smoother than single pictures: it is found again.
 #[test]
 fn moving_cameras_find_the_medium_again() {
-    let Some(gpu) = gpu() else { return };
-    let channel = puff();
-    let (volume, scene) = (uploaded(&gpu, &[&channel]), lit(&channel));
-    let mut look = Look::of_scene(&scene).expect("a look");
-    let quality = COARSE;
-    let measures = RealTime { accumulate: true, ..NONE };
-    let mut renderer = small(&gpu);
-    let aside = look.camera.right * 0.002 * (look.camera.origin - DVec3::new(100.0, -20.0, 5.0)).length();
-    let mut last = Vec::new();
-    for _ in 0..8 {
-        look.camera.origin += aside;
-        last = shown(&mut renderer, &volume, &look, quality, measures);
-    }
-    let mut renderer = small(&gpu);
-    let single = shown(&mut renderer, &volume, &look, quality, measures);
-    let fine = Quality { sky_rays: 24, ..quality };
-    let reference = picture(&mut renderer, &volume, &look, &Pass::March(fine), 0);
-    let ([_, one], [_, many]) = (errors(&single, &reference), errors(&last, &reference));
-    println!("moving: deviation {one:.2e} of a picture alone, {many:.2e} of one that follows others");
-    assert!(many < 0.7 * one, "{one} {many}");
+    with_renderer(|gpu, renderer| {
+        let channel = puff();
+        let (volume, scene) = (uploaded(gpu, &[&channel]), lit(&channel));
+        let mut look = Look::of_scene(&scene).expect("a look");
+        let measures = RealTime { accumulate: true, ..NONE };
+        let distance = (look.camera.origin - DVec3::new(100.0, -20.0, 5.0)).length();
+        let aside = look.camera.right * 0.002 * distance;
+        let mut last = Vec::new();
+        renderer.prepare(&volume, &look, &Pass::Hits, 0, None).expect("a pass");
+        for _ in 0..8 {
+            look.camera.origin += aside;
+            last = shown(renderer, &volume, &look, COARSE, measures);
+        }
+        let reference = picture(renderer, &volume, &look, &Pass::March(MANY), 0);
+        let single = shown(renderer, &volume, &look, COARSE, measures);
+        let ([_, one], [_, many]) = (errors(&single, &reference), errors(&last, &reference));
+        println!("moving: deviation {one:.2e} of a picture alone, {many:.2e} of one that follows others");
+        assert!(many < 0.7 * one, "{one} {many}");
+    });
 }
 
-/// A quarter of the rays: close to all of them, in well less time, and with the edges of a host's scene.
+/// A quarter of the rays: close to all of them, in well less time.
 #[test]
 fn a_quarter_of_the_pixels_is_brought_to_all() {
-    let Some(gpu) = gpu() else { return };
-    let channel = puff();
-    let (volume, scene) = (uploaded(&gpu, &[&channel]), lit(&channel));
-    let look = Look::of_scene(&scene).expect("a look");
-    let mut renderer = small(&gpu);
-    let quality = Quality { sky_rays: 0, ..FINE };
-    // A budget that is never reached measures.
-    let timed = RealTime { budget_ms: Some(f32::MAX), ..NONE };
-    let whole = shown(&mut renderer, &volume, &look, quality, timed);
-    let quarter_measures = RealTime { half_resolution: true, ..timed };
-    let quarter = shown(&mut renderer, &volume, &look, quality, quarter_measures);
-    let [mean, deviation] = errors(&quarter, &whole);
-    let mut least = |measures: RealTime| {
-        let pass = Pass::RealTime { quality, measures };
-        let runs = (0..4).filter_map(|_| {
-            renderer.prepare(&volume, &look, &pass, 0, None).expect("a pass");
-            renderer.run(&volume).expect("a run");
-            renderer.prepare(&volume, &look, &pass, 0, None).expect("a pass");
-            renderer.took_ms()
-        });
-        runs.fold(f32::INFINITY, f32::min)
-    };
-    let [all_ms, quarter_ms] = [least(timed), least(quarter_measures)];
-    println!(
-        "a quarter: mean {mean:.2e}, deviation {deviation:.2e}, {quarter_ms:.1} ms instead of {all_ms:.1}"
-    );
-    assert!(mean < 0.1 && deviation < 0.2 && deviation > 0.0, "{mean} {deviation}");
-    assert!(all_ms.is_infinite() || quarter_ms < 0.6 * all_ms, "{quarter_ms} of {all_ms}");
+    with_renderer(|gpu, renderer| {
+        let channel = puff();
+        let (volume, scene) = (uploaded(gpu, &[&channel]), lit(&channel));
+        let look = Look::of_scene(&scene).expect("a look");
+        let quality = Quality { sky_rays: 0, ..FINE };
+        // A budget that is never reached measures.
+        let timed = RealTime { budget_ms: Some(f32::MAX), ..NONE };
+        let whole = shown(renderer, &volume, &look, quality, timed);
+        let quarter_measures = RealTime { half_resolution: true, ..timed };
+        let quarter = shown(renderer, &volume, &look, quality, quarter_measures);
+        let [mean, deviation] = errors(&quarter, &whole);
+        let mut least = |measures: RealTime| {
+            let pass = Pass::RealTime { quality, measures };
+            let runs = (0..3).filter_map(|_| {
+                renderer.prepare(&volume, &look, &pass, 0, None).expect("a pass");
+                renderer.run(&volume).expect("a run");
+                renderer.prepare(&volume, &look, &pass, 0, None).expect("a pass");
+                renderer.took_ms()
+            });
+            runs.fold(f32::INFINITY, f32::min)
+        };
+        let [all_ms, quarter_ms] = [least(timed), least(quarter_measures)];
+        println!(
+            "a quarter: mean {mean:.2e}, deviation {deviation:.2e}, {quarter_ms:.1} ms instead of {all_ms:.1}"
+        );
+        assert!(mean < 0.1 && deviation < 0.2 && deviation > 0.0, "{mean} {deviation}");
+        assert!(all_ms.is_infinite() || quarter_ms < 0.6 * all_ms, "{quarter_ms} of {all_ms}");
+    });
 }
 
-/// The share of the sun's light at points, held to that of exact shadow rays.
+/// The share of the sun's light at points, held to that of exact shadow rays: with steps, and without.
 #[test]
 fn points_get_the_light_that_the_volume_leaves() {
-    let Some(gpu) = gpu() else { return };
-    let channel = puff();
-    let (volume, scene) = (uploaded(&gpu, &[&channel]), lit(&channel));
-    let look = Look::of_scene(&scene).expect("a look");
-    let Some(Light::Sun(sun)) = look.lights.first() else { panic!("no sun") };
-    let field = Field::new(&channel).expect("a field");
-    let world_box = nuage_render::framing::WorldBox::of(&channel).expect("a place");
-    let (middle, size) = (world_box.centre(), (world_box.max - world_box.min).length());
-    // In, before and behind the volume, and beside it.
-    let points: Vec<DVec3> = (0..1000_u32)
-        .map(|i| {
-            let unit =
-                |d| f64::from(nuage_render::hash::unit_f32(nuage_render::hash::hash_pixel(i, 1, 2, d))) - 0.5;
-            middle + DVec3::new(unit(0), unit(1), unit(2)) * size
-        })
-        .collect();
-    let from_camera: Vec<[f32; 3]> =
-        points.iter().map(|p| (*p - look.camera.origin).as_vec3().to_array()).collect();
-    let mut renderer = Renderer::new(&gpu, [50, 20]).expect("a renderer");
-    renderer.set_points(&from_camera).expect("points");
-    let quality = Quality { shadow_step_voxels: 0.5, shadow_growth: 0.0, ..FINE };
-    let found = picture(&mut renderer, &volume, &look, &Pass::Shadow(quality), 0);
-    let mut reader = field.reader();
-    let (mut worst, mut shaded) = (0.0_f32, 0);
-    for (p, found) in points.iter().zip(&found) {
-        let ray = Ray { origin: *p, direction: sun.direction_to.as_dvec3().normalize() };
-        let depth = optical_depth(&field, &mut reader, &ray, Filter::Trilinear);
-        let expected = (-depth * look.media[0].extinction[0]).exp();
-        worst = worst.max((found[0] - expected).abs());
-        shaded += usize::from(expected < 0.9);
-    }
-    println!("{shaded} of 1000 points are shaded, the worst is off by {worst:.2e}");
-    assert!(shaded > 100 && worst < 4e-3, "{shaded} {worst}");
-    let too_many = renderer.set_points(&vec![[0.0; 3]; 1001]);
-    assert!(matches!(too_many, Err(GpuError::Misuse(_))), "{too_many:?}");
+    with_renderer(|gpu, renderer| {
+        let channel = puff();
+        let (volume, scene) = (uploaded(gpu, &[&channel]), lit(&channel));
+        let look = Look::of_scene(&scene).expect("a look");
+        let Some(Light::Sun(sun)) = look.lights.first() else { panic!("no sun") };
+        let field = Field::new(&channel).expect("a field");
+        let world_box = nuage_render::framing::WorldBox::of(&channel).expect("a place");
+        let (middle, size) = (world_box.centre(), (world_box.max - world_box.min).length());
+        // In, before and behind the volume, and beside it.
+        let points: Vec<DVec3> = (0..1000_u32)
+            .map(|i| {
+                let unit = |d| {
+                    f64::from(nuage_render::hash::unit_f32(nuage_render::hash::hash_pixel(i, 1, 2, d))) - 0.5
+                };
+                middle + DVec3::new(unit(0), unit(1), unit(2)) * size
+            })
+            .collect();
+        let from_camera: Vec<[f32; 3]> =
+            points.iter().map(|p| (*p - look.camera.origin).as_vec3().to_array()).collect();
+        let mut reader = field.reader();
+        let mut expected = |p: &DVec3| {
+            let ray = Ray { origin: *p, direction: sun.direction_to.as_dvec3().normalize() };
+            (-optical_depth(&field, &mut reader, &ray, Filter::Trilinear) * look.media[0].extinction[0]).exp()
+        };
+        let expected: Vec<f32> = points.iter().map(&mut expected).collect();
+        let shaded = expected.iter().filter(|passes| **passes < 0.9).count();
+        for (shadow_step_voxels, tolerance) in [(0.5, 4e-3), (0.0, 1e-4)] {
+            let quality = Quality { shadow_step_voxels, shadow_growth: 0.0, ..FINE };
+            renderer.set_points(&from_camera).expect("points");
+            let found = picture(renderer, &volume, &look, &Pass::Shadow(quality), 0);
+            let errors = found.iter().zip(&expected).map(|(found, expected)| (found[0] - expected).abs());
+            let worst = errors.fold(0.0, f32::max);
+            println!(
+                "steps of {shadow_step_voxels}: {shaded} points are shaded, the worst is off by {worst:.2e}"
+            );
+            assert!(shaded > 100 && worst < tolerance, "{shaded} {worst}");
+        }
+        let too_many = renderer.set_points(&vec![[0.0; 3]; 48 * 27 + 1]);
+        assert!(matches!(too_many, Err(GpuError::Misuse(_))), "{too_many:?}");
+    });
+}
+
+/// What only one grid can have is refused, with words.
+#[test]
+fn several_media_are_refused() {
+    with_renderer(|gpu, renderer| {
+        let channel = puff();
+        let (volume, scene) = (uploaded(gpu, &[&channel]), lit(&channel));
+        let mut look = Look::of_scene(&scene).expect("a look");
+        look.media.push(look.media[0].clone());
+        let measures = RealTime::default();
+        for pass in [Pass::RealTime { quality: COARSE, measures }, Pass::Shadow(COARSE)] {
+            let refused = renderer.prepare(&volume, &look, &pass, 0, None);
+            assert!(matches!(refused, Err(GpuError::Unsupported { .. })), "{refused:?}");
+        }
+    });
 }
 
 /// A third of the time is enough for a picture, if it has to be.
 #[test]
 fn pictures_take_no_longer_than_they_may() {
-    let Some(gpu) = gpu() else { return };
-    let channel = puff();
-    let (volume, scene) = (uploaded(&gpu, &[&channel]), lit(&channel));
-    let look = Look::of_scene(&scene).expect("a look");
-    let mut renderer = small(&gpu);
-    let mut took = |budget_ms: f32| {
-        let pass =
-            Pass::RealTime { quality: FINE, measures: RealTime { budget_ms: Some(budget_ms), ..NONE } };
-        renderer.prepare(&volume, &look, &pass, 0, None).expect("a pass");
-        let start = std::time::Instant::now();
-        renderer.run(&volume).expect("a run");
-        renderer.took(start.elapsed().as_secs_f32() * 1e3);
-        renderer.prepare(&volume, &look, &pass, 0, None).expect("a pass");
-        renderer.took_ms().expect("a time")
-    };
-    let unbounded = (0..4).map(|_| took(f32::MAX)).fold(f32::INFINITY, f32::min);
-    let budget_ms = unbounded / 3.0;
-    let mut times: Vec<f32> = (0..21).map(|_| took(budget_ms)).skip(12).collect();
-    times.sort_by(f32::total_cmp);
-    println!("{unbounded:.1} ms without a bound; of {budget_ms:.1} ms pictures take {times:.1?}");
-    // Others use this machine too.
-    assert!(times[4] < 1.3 * budget_ms, "{times:?} of {budget_ms}");
+    with_renderer(|gpu, renderer| {
+        let channel = puff();
+        let (volume, scene) = (uploaded(gpu, &[&channel]), lit(&channel));
+        let look = Look::of_scene(&scene).expect("a look");
+        let quality = Quality { sky_rays: 0, ..FINE };
+        let mut took = |budget_ms: f32| {
+            let measures = RealTime { budget_ms: Some(budget_ms), ..RealTime::default() };
+            let pass = Pass::RealTime { quality, measures };
+            renderer.prepare(&volume, &look, &pass, 0, None).expect("a pass");
+            renderer.run(&volume).expect("a run");
+            // Times of devices that write them come back with the next picture.
+            renderer.prepare(&volume, &look, &pass, 0, None).expect("a pass");
+            renderer.took_ms().expect("a time")
+        };
+        let unbounded = (0..3).map(|_| took(f32::MAX)).fold(f32::INFINITY, f32::min);
+        let budget_ms = unbounded / 3.0;
+        let mut times: Vec<f32> = (0..17).map(|_| took(budget_ms)).skip(10).collect();
+        times.sort_by(f32::total_cmp);
+        println!("{unbounded:.1} ms without a bound; of {budget_ms:.1} ms pictures take {times:.1?}");
+        // Others use this machine too.
+        assert!(times[3] < 1.3 * budget_ms, "{times:?} of {budget_ms}");
+    });
 }

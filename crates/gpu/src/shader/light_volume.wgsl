@@ -30,7 +30,7 @@ fn light_volume(@builtin(global_invocation_id) id: vec3<u32>) {
             break;
         }
         let run = found.run;
-        let pieces = select(1.0, ceil((run.t1 - run.t0) / step), run.is_varying);
+        let pieces = select(1.0, clamp(ceil((run.t1 - run.t0) / step), 1.0, MOST_PIECES), run.is_varying);
         let length = (run.t1 - run.t0) / pieces;
         for (var piece = 0.0; piece < pieces && depth <= params.march_rays.z; piece += 1.0) {
             let t = run.t0 + piece * length;

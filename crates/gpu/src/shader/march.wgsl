@@ -292,7 +292,7 @@ fn march_radiance(ray: Ray, max_distance: f32, random: u32, shift: f32) -> vec4<
         let piece_depth = constant_density * scale * (t1 - t0);
         if (!is_varying && is_lit && piece_depth > 0.0) {
             let wanted = max(piece_depth / LIT_PIECE_DEPTH, (t1 - t0) * voxels_per_length / LIT_PIECE_VOXELS);
-            pieces = clamp(ceil(wanted), 1.0, 65536.0);
+            pieces = clamp(ceil(wanted), 1.0, MOST_PIECES);
         }
         var piece = 0.0;
         loop {
