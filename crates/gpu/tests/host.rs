@@ -168,7 +168,7 @@ fn volumes_end_at_the_depth_buffer() {
         assert!(cut > 2000 && worst < 1e-3, "{name}: {cut}, {worst}");
     }
     // The shadow on the wall of a sun behind the camera has a closed form too.
-    let sun = Sun::point(Vec3::new(0.3, 0.2, 1.0), [1.0; 3]);
+    let sun = Sun::point(Vec3::new(0.3, 0.2, 1.0).normalize(), [1.0; 3]);
     let in_light = Look { lights: vec![Light::Sun(sun)], ..look.clone() };
     let quality = Quality { shadow_step_voxels: 0.5, shadow_growth: 0.0, ..quality };
     for (name, clip_from_view) in projections {
@@ -179,7 +179,7 @@ fn volumes_end_at_the_depth_buffer() {
             let at = DVec2::new(f64::from(i % SIZE[0]), f64::from(i / SIZE[0])) + 0.5;
             let ray = scene.camera.ray(at, SIZE[0], SIZE[1]);
             let place = ray.origin + ray.direction * (wall / ray.direction.dot(scene.camera.forward));
-            let to_sun = sun.direction_to.as_dvec3().normalize();
+            let to_sun = sun.direction_to.as_dvec3();
             let leaves = ((last.as_dvec3() * voxel - place) / to_sun).min_element();
             // Where the ray leaves the block by its front, and begins well inside.
             let out = place + to_sun * leaves;
