@@ -4,6 +4,7 @@
 //! A subcommand takes its arguments and returns; it never ends the process itself. What it computes lives in
 //! the libraries, what it prints in modules of its own.
 
+mod bench;
 mod convert;
 mod demo;
 mod denoise;
@@ -55,6 +56,7 @@ enum Command {
     Info(info::Args),
     Probe(probe::Args),
     Render(Box<render::Args>),
+    Bench(bench::Args),
     Demo(demo::Args),
     Diff(Box<diff::Args>),
     Validate(validate::Args),
@@ -73,6 +75,7 @@ fn main() -> ExitCode {
             let given = matches.subcommand_matches("render").map(Given::of).unwrap_or_default();
             render::run(&args, &given)
         }
+        Command::Bench(args) => bench::run(&args),
         Command::Demo(args) => demo::run(&args),
         Command::Diff(args) => diff::run(&args),
         Command::Validate(args) => validate::run(&args),

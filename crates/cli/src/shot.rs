@@ -451,6 +451,42 @@ impl Shot {
         }
     }
 
+    /// What a GPU is asked to show.
+    #[cfg(feature = "gpu")]
+    fn asked(&self, frame: &Frame<'_>) -> nuage_gpu::picture::Asked {
+        use nuage_gpu::picture::Asked;
+        let look = &self.plan.look;
+        let surface = frame.iter().copied().flatten().find_map(|volume| volume.surface);
+        match (look.view, look.integrator) {
+            (Some(view), _) => Asked::View(library_view(view, surface, &self.scene(frame))),
+            (None, Integrator::March) => Asked::March(self.quality()),
+            (None, Integrator::Path) => {
+                let plan = self.paths();
+                Asked::Path { settings: plan.settings, samples: plan.samples }
+            }
+        }
+    }
+
+    /// How a GPU shows a frame that it has already, and the first pass of it.
+    ///
+    /// # Errors
+    /// If it cannot.
+    #[cfg(feature = "gpu")]
+    pub(crate) fn pass(
+        &self,
+        frame: &Frame<'_>,
+    ) -> Result<(nuage_gpu::look::Look, nuage_gpu::look::Pass), nuage_gpu::error::GpuError> {
+        use nuage_gpu::look::Pass;
+        use nuage_gpu::picture::Asked;
+        let look = nuage_gpu::look::Look::of_scene(&self.scene(frame))?;
+        let pass = match self.asked(frame) {
+            Asked::View(view) => Pass::View(view),
+            Asked::March(quality) => Pass::March(quality),
+            Asked::Path { settings, .. } => Pass::Path { settings, sample: 0 },
+        };
+        Ok((look, pass))
+    }
+
     /// Renders a frame on a GPU: composited, exposed.
     ///
     /// # Errors
@@ -462,18 +498,10 @@ impl Shot {
         frame: &Frame<'_>,
         progress: &dyn Fn(u32, u32),
     ) -> Result<Image, String> {
-        use nuage_gpu::picture::{Asked, render};
         let (scene, look) = (self.scene(frame), &self.plan.look);
-        let surface = frame.iter().copied().flatten().find_map(|volume| volume.surface);
-        let asked = match (look.view, look.integrator) {
-            (Some(view), _) => Asked::View(library_view(view, surface, &scene)),
-            (None, Integrator::March) => Asked::March(self.quality()),
-            (None, Integrator::Path) => {
-                let plan = self.paths();
-                Asked::Path { settings: plan.settings, samples: plan.samples }
-            }
-        };
-        let image = render(gpu, &scene, &asked, self.size(), progress).map_err(|error| error.to_string())?;
+        let asked = self.asked(frame);
+        let image = nuage_gpu::picture::render(gpu, &scene, &asked, self.size(), progress)
+            .map_err(|error| error.to_string())?;
         let image = self.before(image, &scene);
         // Views are not light.
         Ok(if look.exposure == 0.0 || look.view.is_some() { image } else { image.exposed(look.exposure) })

@@ -23,8 +23,12 @@ use nuage_volume::space::{BRICK_VOXELS, NODE4_SLOTS, NODE5_SLOTS};
 
 use crate::blocks;
 use crate::error::GpuError;
+use crate::maps;
 use crate::params::{Field, Place};
 use crate::shader::{HEADER_WORDS, codec_bit};
+
+/// Maps of bricks take at most this part of the bytes of trees and bricks: a look-up is then worth its memory.
+const MAP_SHARE: usize = 8;
 
 /// In which form bricks are kept on the device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -57,7 +61,7 @@ pub enum Meaning {
 
 impl Meaning {
     /// Scale, bias, and the largest value.
-    fn line(self) -> [f32; 3] {
+    pub(crate) fn line(self) -> [f32; 3] {
         match self {
             Meaning::Density => [1.0, 0.0, f32::MAX],
             Meaning::Fog { band } => [-1.0 / band, 0.0, 1.0],
@@ -92,6 +96,9 @@ pub struct Arrays {
     channels: usize,
     codecs: u32,
     origin: DVec3,
+    /// Flat maps of bricks, and where that of each place begins; empty if they would be large beside the rest.
+    maps: Vec<u32>,
+    first_map_words: Vec<u32>,
 }
 
 /// How much a volume has to hold.
@@ -177,6 +184,7 @@ impl Arrays {
         }
         arrays.trees = packer.finish();
         arrays.settle();
+        arrays.make_maps();
         Ok(arrays)
     }
 
@@ -242,6 +250,7 @@ impl Arrays {
             }
         }
         arrays.settle();
+        arrays.make_maps();
         Ok(arrays)
     }
 
@@ -304,6 +313,16 @@ impl Arrays {
             }
         }
         (self.words, self.shapes) = (words, shape_words);
+    }
+
+    /// Channels of one frame whose trees are built on the device, in bricks of floats.
+    pub(crate) fn of_places(places: Vec<Place>) -> Arrays {
+        let (largest, channels) = (vec![0.0; places.len()], places.len());
+        let places = places.into_iter().map(Some).collect();
+        let mut arrays =
+            Arrays { places, largest, channels, codecs: codec_bit(Codec::F32), ..Arrays::default() };
+        arrays.settle();
+        arrays
     }
 
     /// Takes the finest tree of a grid.
@@ -454,10 +473,62 @@ impl Arrays {
         self.origin = if middle.is_finite() { middle } else { DVec3::ZERO };
     }
 
+    /// Makes maps of all places, unless they take more than a part of what stands there already.
+    fn make_maps(&mut self) {
+        // Of trees whose bricks are not there, the size alone is wanted.
+        if self.is_room {
+            return;
+        }
+        let [trees, bricks] = self.size_bytes();
+        let boxes: Vec<[IVec3; 2]> = self.places.iter().flatten().map(Place::bricks).collect();
+        let counts = boxes.iter().map(|[first, last]| maps::cell_count(*first, *last));
+        let cells = counts.sum::<Option<usize>>().and_then(|count| count.checked_mul(4 * maps::CELL_WORDS));
+        if cells.is_none_or(|bytes| bytes > (trees + bricks) / MAP_SHARE) {
+            return;
+        }
+        // Frames of the same tree share a map.
+        let mut known: HashMap<([u32; 2], [IVec3; 2]), u32> = HashMap::new();
+        let mut words = Vec::new();
+        let mut firsts = Vec::with_capacity(self.places.len());
+        for place in &self.places {
+            let Some(place) = place else {
+                firsts.push(0);
+                continue;
+            };
+            let key = (place.cells, place.bricks());
+            let first = match known.get(&key) {
+                Some(first) => *first,
+                None => {
+                    let [low, high] = place.bricks();
+                    let Some(map) = maps::map(&self.trees, place.cells, low, high) else { return };
+                    let first = words.len() as u32;
+                    words.extend(map);
+                    known.insert(key, first);
+                    first
+                }
+            };
+            firsts.push(first);
+        }
+        (self.maps, self.first_map_words) = (words, firsts);
+    }
+
+    /// Whether all values mean themselves.
+    pub(crate) fn are_densities(&self) -> bool {
+        self.places.iter().flatten().all(|place| place.meaning == Meaning::Density.line())
+    }
+
+    /// Whether all fields have a map.
+    pub(crate) fn has_maps(&self) -> bool {
+        !self.maps.is_empty()
+    }
+
     /// Takes other frames for what is to be the same for all: their origin, their codecs, and their largest values.
     pub(crate) fn agree_with(&mut self, other: &Arrays) {
         self.origin = other.origin;
         self.codecs |= other.codecs;
+        // Frames that take each other's place have room for trees alone.
+        self.maps.clear();
+        self.first_map_words.clear();
         for (largest, other) in self.largest.iter_mut().zip(&other.largest) {
             *largest = largest.max(*other);
         }
@@ -517,7 +588,7 @@ impl Arrays {
         let bricks = |(format, words): (&BlockFormat, &Vec<u32>)| words.len() / blocks::brick_words(*format);
         let mut of_formats = blocks::FORMATS.iter().zip(&self.blocks).map(bricks);
         Room {
-            tree_words: HEADER_WORDS + self.trees.size_bytes() / size_of::<u32>(),
+            tree_words: HEADER_WORDS + self.trees.size_bytes() / size_of::<u32>() + self.maps.len(),
             fields: self.places.len().max(1),
             brick_words: self.words.len() + self.shapes.len(),
             blocks: std::array::from_fn(|_| of_formats.next().unwrap_or(0)),
@@ -529,13 +600,17 @@ impl Arrays {
         let field =
             |place: &Option<Place>| place.as_ref().map_or_else(Field::default, |p| p.field(self.origin));
         let mut fields: Vec<Field> = self.places.iter().map(field).collect();
+        let trees_words = HEADER_WORDS + self.trees.size_bytes() / 4;
+        for (field, first) in fields.iter_mut().zip(&self.first_map_words) {
+            field.box_last[3] = (trees_words + *first as usize) as i32;
+        }
         if fields.is_empty() {
             fields.push(Field::default());
         }
         fields
     }
 
-    /// The trees in one array of words, which begins by saying where each of them does.
+    /// The trees in one array of words, which begins by saying where each of them does, and the maps behind them.
     pub(crate) fn tree_words(&self) -> Vec<u32> {
         let Trees { cells, node5s, node4s, entries, masks } = &self.trees;
         let arrays: [&[u32]; 5] = [
@@ -555,6 +630,7 @@ impl Arrays {
         words.extend([self.words.len() as u32, self.channels as u32]);
         words.resize(HEADER_WORDS, 0);
         arrays.iter().for_each(|array| words.extend_from_slice(array));
+        words.extend_from_slice(&self.maps);
         words
     }
 

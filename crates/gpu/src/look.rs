@@ -4,6 +4,7 @@
 use glam::{DAffine3, DMat4, DVec3, Vec3};
 use nuage_render::camera::Camera;
 use nuage_render::color::Blackbody;
+use nuage_render::filter::Filter;
 use nuage_render::light::{Light, Sky};
 use nuage_render::march::Quality;
 use nuage_render::path::PathSettings;
@@ -17,6 +18,9 @@ pub use crate::params::{MAX_LIGHTS, MAX_MEDIA};
 use crate::real_time::RealTime;
 use crate::shader::SOLID_CHANNEL;
 use crate::upload::Volume;
+
+/// The shortest step of [`Pass::Opacity`]: no more than seven samples then lie in a voxel, even from corner to corner.
+const SHORTEST_STEP_VOXELS: f32 = 0.25;
 
 /// How volumes are to look.
 #[derive(Debug, Clone)]
@@ -64,8 +68,19 @@ pub enum MediumPlace {
 pub enum Pass {
     /// A debug view.
     View(View),
-    /// Of each pixel the distance of the first voxel above 0, negative if there is none, and the voxel's index.
-    Hits,
+    /// Of each pixel the distance of the first voxel above a value, negative if there is none, and the voxel's index.
+    Hits {
+        /// The value, not negative.
+        above: f32,
+    },
+    /// One minus the share of light that passes, as the product of `1 - extinction × value × step` over samples at whole
+    /// multiples of a step from the camera: `nuage_render::depth::stepped_transmittance`.
+    Opacity {
+        /// How values are made of voxels.
+        filter: Filter,
+        /// The step.
+        step_voxels: f32,
+    },
     /// Of each pixel the distance at which a level is reached, negative if it is not.
     SurfaceHits {
         /// The value at the surface.
@@ -216,7 +231,14 @@ impl Look {
         }
         match *pass {
             Pass::View(view) => self.view(&mut params, volume, view, frame),
-            Pass::Hits => params.counts[2] = 4,
+            Pass::Hits { above } => (params.counts[2], params.view[3]) = (4, above),
+            Pass::Opacity { filter, step_voxels } => {
+                params.counts[2] = match filter {
+                    Filter::Nearest => 5,
+                    Filter::Trilinear => 6,
+                };
+                params.march[0] = step_voxels;
+            }
             Pass::SurfaceHits { level } => (params.counts[2], params.view[3]) = (4, level),
             Pass::March(quality) | Pass::RealTime { quality, .. } | Pass::Shadow(quality) => {
                 self.march(&mut params, quality);
@@ -248,6 +270,11 @@ impl Look {
         };
         let is_point_sun = |light: &Light| matches!(light, Light::Sun(sun) if sun.angle_degrees <= 0.0);
         match pass {
+            Pass::Opacity { step_voxels, .. }
+                if step_voxels.is_nan() || *step_voxels < SHORTEST_STEP_VOXELS =>
+            {
+                unsupported("steps of less than a quarter of a voxel")
+            }
             Pass::March(_) | Pass::RealTime { .. } | Pass::Shadow(_) if !self.is_grey() => {
                 unsupported("an extinction with a colour in one scattering")
             }

@@ -79,12 +79,21 @@ impl Place {
 
     /// The brick that positions count from.
     pub(crate) fn base_brick(&self) -> IVec3 {
-        (self.active_box.min.saturating_sub(IVec3::ONE) >> LOG2_BRICK) - 1
+        self.bricks()[0] - 1
+    }
+
+    /// The first and the last brick that matter.
+    pub(crate) fn bricks(&self) -> [IVec3; 2] {
+        // Cells reach one voxel below the active ones, and the widest filter one further to both sides.
+        let first = self.active_box.min.saturating_sub(IVec3::splat(2));
+        let last = self.active_box.max.saturating_add(IVec3::ONE);
+        [first >> LOG2_BRICK, last >> LOG2_BRICK]
     }
 
     /// The field, in a world that begins at `origin`: as `nuage_render::traverse::Field` has it.
     pub(crate) fn field(&self, origin: DVec3) -> Field {
         let (min, max) = (self.active_box.min.saturating_sub(IVec3::ONE), self.active_box.max);
+        let [first_brick, last_brick] = self.bricks();
         let base_brick = self.base_brick();
         let base = (base_brick << LOG2_BRICK).as_dvec3();
         let index_from_world = self.world_from_index.inverse();
@@ -102,9 +111,8 @@ impl Place {
             bounds_min: place(min.as_dvec3() - base, self.bounds_unit),
             bounds_max: place(max.as_dvec3() + 1.0 - base, self.floor),
             base_brick: whole(base_brick, self.cells[0]),
-            // The widest filter reaches one voxel further than others.
-            box_first: whole(min.saturating_sub(IVec3::ONE) >> LOG2_BRICK, self.cells[1]),
-            box_last: whole(max.saturating_add(IVec3::ONE) >> LOG2_BRICK, 0),
+            box_first: whole(first_brick, self.cells[1]),
+            box_last: whole(last_brick, 0),
             active_min: whole(self.active_box.min, 0),
             active_max: whole(self.active_box.max, 0),
             value: [scale, bias, most, 0.0],

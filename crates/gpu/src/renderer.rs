@@ -34,6 +34,17 @@ pub struct Depth<'a> {
     pub clip_from_world: DMat4,
 }
 
+/// What all rays of a picture look up in a volume.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Counts {
+    /// Walks through the volume, of camera rays, shadow rays and stretches of paths.
+    pub rays: u64,
+    /// Look-ups of what stands at a brick.
+    pub regions: u64,
+    /// Voxels of which the value was taken; a trilinear sample takes eight.
+    pub values: u64,
+}
+
 /// Renders one volume at a time into a picture on the device.
 #[derive(Debug)]
 pub struct Renderer {
@@ -150,16 +161,29 @@ impl Renderer {
         depth: Option<&Depth<'_>>,
     ) -> Result<(), GpuError> {
         check_frame(volume, frame)?;
-        let source = match pass {
-            Pass::View(View::Surface { .. }) | Pass::SurfaceHits { .. } => Source::Surface,
-            Pass::View(_) | Pass::Hits => Source::Views,
-            Pass::March(_) | Pass::RealTime { .. } => Source::March,
-            Pass::Shadow(_) => Source::Shadow,
-            Pass::Path { .. } => Source::Path,
-        };
-        self.prepare_shader(volume, look, pass, frame, depth, source)
+        self.prepare_shader(volume, look, pass, frame, depth, source_of(pass), false)
     }
 
+    /// What the rays of a picture look up: runs the pass once more, with shaders that count. The picture is gone then.
+    ///
+    /// # Errors
+    /// As [`Renderer::prepare`] and [`Renderer::run`].
+    pub fn count(
+        &mut self,
+        volume: &Volume,
+        look: &Look,
+        pass: &Pass,
+        frame: usize,
+    ) -> Result<Counts, GpuError> {
+        check_frame(volume, frame)?;
+        self.prepare_shader(volume, look, pass, frame, None, source_of(pass), true)?;
+        self.run(volume)?;
+        let counted: Vec<[f32; 4]> = bytemuck::pod_collect_to_vec(&self.gpu.read(&self.picture)?);
+        let sum = |i: usize| counted.iter().map(|pixel| pixel[i] as u64).sum();
+        Ok(Counts { rays: sum(0), regions: sum(1), values: sum(2) })
+    }
+
+    #[allow(clippy::too_many_arguments, reason = "what is shown, how, and by what")]
     fn prepare_shader(
         &mut self,
         volume: &Volume,
@@ -168,6 +192,7 @@ impl Renderer {
         frame: usize,
         depth: Option<&Depth<'_>>,
         source: Source,
+        counts: bool,
     ) -> Result<(), GpuError> {
         let mut pass = *pass;
         let mut light_step_voxels = 0.0;
@@ -188,8 +213,11 @@ impl Renderer {
             Some(stages) => stages.forget(),
             None => {}
         }
-        let features =
-            Features { has_light_volume, ..features(volume, look, &pass, source, depth.is_some()) };
+        let features = Features {
+            counts,
+            has_light_volume,
+            ..features(volume, look, &pass, source, depth.is_some(), params.counts[2])
+        };
         if let Some(depth) = depth {
             [params.clip_x, params.clip_y, params.clip_z, params.clip_w] =
                 world_from_clip(&depth.clip_from_world, volume.origin());
@@ -275,7 +303,7 @@ impl Renderer {
         pass: &Pass,
         source: Source,
     ) -> Result<(), GpuError> {
-        self.prepare_shader(volume, look, pass, 0, None, source)?;
+        self.prepare_shader(volume, look, pass, 0, None, source, false)?;
         self.prepared = self.prepared.take().map(|prepared| Prepared { is_first: false, ..prepared });
         Ok(())
     }
@@ -366,6 +394,11 @@ impl Renderer {
                 cache: None,
             })
         })
+    }
+
+    /// The WGSL of what was prepared, for programs that say what a device would make of it.
+    pub fn shader(&self) -> Option<String> {
+        self.prepared.as_ref().map(|Prepared { key: (source, features), .. }| source.text(features))
     }
 
     /// Records what was prepared into an encoder: the picture is there once that is submitted and done.
@@ -555,7 +588,14 @@ impl Renderer {
 }
 
 /// What the shader of a pass must be able to do.
-fn features(volume: &Volume, look: &Look, pass: &Pass, source: Source, has_depth: bool) -> Features {
+fn features(
+    volume: &Volume,
+    look: &Look,
+    pass: &Pass,
+    source: Source,
+    has_depth: bool,
+    view: u32,
+) -> Features {
     let (chunks, log2_chunk_words) = volume.chunks();
     let is_lit = matches!(source, Source::March | Source::Path | Source::Shadow);
     let (lookup, sky_rays, shadow_step_voxels) = match *pass {
@@ -584,7 +624,11 @@ fn features(volume: &Volume, look: &Look, pass: &Pass, source: Source, has_depth
         has_depth: has_depth && is_lit,
         is_real_time: matches!(pass, Pass::RealTime { .. }),
         has_light_volume: false,
+        has_maps: volume.has_maps(),
+        are_densities: volume.are_densities(),
+        view: if is_lit { 0 } else { view },
         encodes_srgb: false,
+        counts: false,
     }
 }
 
@@ -596,6 +640,17 @@ fn changed(new: &[u8], old: &[u8]) -> Range<usize> {
     match (units.clone().find(is_changed), units.rev().find(is_changed)) {
         (Some(first), Some(last)) => first * UNIT..new.len().min((last + 1) * UNIT),
         _ => 0..0,
+    }
+}
+
+/// The shader of a pass.
+fn source_of(pass: &Pass) -> Source {
+    match pass {
+        Pass::View(View::Surface { .. }) | Pass::SurfaceHits { .. } => Source::Surface,
+        Pass::View(_) | Pass::Hits { .. } | Pass::Opacity { .. } => Source::Views,
+        Pass::March(_) | Pass::RealTime { .. } => Source::March,
+        Pass::Shadow(_) => Source::Shadow,
+        Pass::Path { .. } => Source::Path,
     }
 }
 
@@ -632,7 +687,7 @@ mod tests {
             let stages = renderer.stages().expect("stages");
             stages.ask(&gpu, quality, RealTime::default()).expect("a quality");
             assert!(stages.settle(&mut params, volume, look, frame), "no light volume");
-            let features = features(volume, look, &pass, Source::March, has_depth);
+            let features = features(volume, look, &pass, Source::March, has_depth, 0);
             let features = Features { has_light_volume: true, ..features };
             stages.advance(&mut params, volume, &features).contains(&Source::LightVolume)
         };

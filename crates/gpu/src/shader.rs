@@ -4,6 +4,7 @@
 //! What does not live here: pipelines ([`crate::renderer`]).
 
 use std::fmt::Write as _;
+use std::mem::offset_of;
 
 use nuage_render::color::Blackbody;
 use nuage_render::filter::Lookup;
@@ -11,18 +12,20 @@ use nuage_render::{color, envmap, hash, march, math, path, phase, surface, trave
 use nuage_volume::brick::f32_from_finite_f16;
 use nuage_volume::codec::block::{BlockFormat, PackingAxis, bc7};
 use nuage_volume::codec::{self, Codec, bounds, sparse};
-use nuage_volume::packed::{Entry, RootCell};
-use nuage_volume::space::{LOG2_BRICK, LOG2_NODE4_BRICKS, LOG2_NODE5_BRICKS, NODE4_SLOTS, NODE5_SLOTS};
+use nuage_volume::packed::{Entry, RootCell, mask};
+use nuage_volume::space::{
+    BRICK_VOXELS, LOG2_BRICK, LOG2_NODE4_BRICKS, LOG2_NODE5_BRICKS, NODE4_SLOTS, NODE5_SLOTS,
+};
 
 use crate::blocks::FORMATS;
-use crate::params::{self, MAX_LIGHTS, MAX_MEDIA};
+use crate::build;
+use crate::maps::{self, ABSENT_TAG};
+use crate::params::{self, Field, MAX_LIGHTS, MAX_MEDIA};
 use crate::upload::FIRST_TEXTURE;
 use crate::{blue_noise, light_volume, real_time};
 
 /// Pixels along each side of a workgroup.
 pub(crate) const WORKGROUP_SIDE: u32 = 8;
-/// The tag of an entry that is not there.
-const ABSENT_TAG: u32 = 254;
 /// The most random numbers of one path, and leaps of one ray over regions of many bricks: paths and volumes that ask for more
 /// would keep a device busy until its driver takes it for lost.
 const MAX_DRAWS: u32 = 1 << 20;
@@ -63,8 +66,16 @@ pub(crate) struct Features {
     pub(crate) is_real_time: bool,
     /// Whether the sun's light is read from the light volume.
     pub(crate) has_light_volume: bool,
+    /// Whether bricks are looked up in maps.
+    pub(crate) has_maps: bool,
+    /// Whether all values mean themselves.
+    pub(crate) are_densities: bool,
+    /// What a view shows. Others have none.
+    pub(crate) view: u32,
     /// Whether a target takes encoded colours.
     pub(crate) encodes_srgb: bool,
+    /// Whether look-ups are counted in place of light.
+    pub(crate) counts: bool,
 }
 
 impl Features {
@@ -85,7 +96,11 @@ impl Features {
         has_depth: false,
         is_real_time: false,
         has_light_volume: false,
+        has_maps: false,
+        are_densities: true,
+        view: 0,
         encodes_srgb: false,
+        counts: false,
     };
 
     /// All there is.
@@ -106,7 +121,11 @@ impl Features {
         has_depth: false,
         is_real_time: false,
         has_light_volume: false,
+        has_maps: true,
+        are_densities: false,
+        view: 0,
         encodes_srgb: true,
+        counts: false,
     };
 
     /// What matters to a shader: all, but to those that read nothing of the volume.
@@ -143,8 +162,8 @@ fn lookup_number(lookup: Lookup) -> u32 {
 }
 
 /// The kinds of codecs of which decoders can be left out.
-const CODEC_KINDS: [&str; 9] =
-    ["F32", "F16", "UNIFORM", "SPARSE", "SPLIT", "BLOCK", "LATTICE", "GRADIENT", "SHARED"];
+const CODEC_KINDS: [&str; 10] =
+    ["F32", "F16", "UNIFORM", "SPARSE", "SPLIT", "BLOCK", "LATTICE", "GRADIENT", "SHARED", "UNEVEN"];
 
 /// The bit of a codec's kind.
 pub(crate) fn codec_bit(codec: Codec) -> u32 {
@@ -152,6 +171,8 @@ pub(crate) fn codec_bit(codec: Codec) -> u32 {
         Codec::Constant => return 0,
         Codec::F32 => 0,
         Codec::F16 => 1,
+        // Codes that reach over the ends of words are a kind of their own.
+        Codec::Uniform { bits } if u32::BITS % u32::from(bits) != 0 => return 1 << 2 | 1 << 9,
         Codec::Uniform { .. } => 2,
         Codec::Sparse { .. } => 3,
         Codec::Split { .. } => 4,
@@ -196,7 +217,7 @@ macro_rules! file {
 }
 
 /// What all but [`Source::Tone`] begin with.
-const COMMON: [&str; 10] = [
+const COMMON: [&str; 11] = [
     file!("math"),
     file!("hash"),
     file!("phase"),
@@ -205,6 +226,7 @@ const COMMON: [&str; 10] = [
     file!("tree"),
     file!("block"),
     file!("codec"),
+    file!("brick"),
     file!("filter"),
     file!("walk"),
 ];
@@ -241,33 +263,60 @@ impl Source {
         text += picture;
         text += &brick_words(features);
         text += &block_texels(features);
+        text += if features.counts { file!("count") } else { file!("no_count") };
         COMMON.iter().for_each(|part| text += part);
         let end = if features.has_depth { file!("depth_end") } else { file!("open_end") };
         let kind = if features.is_real_time { file!("real_time") } else { file!("still") };
-        let first_voxel = hdda(&Body {
-            name: "meet_voxel",
-            state: "VoxelHit",
-            layer: Layer::Voxel,
-            step: "let value = in_region(field, region, voxel);
-            if (value > 0.0 && is_active(field, voxel)) {
-                *state = VoxelHit(true, t0, voxel, value);
+        let first_voxel = hdda(
+            features,
+            &Body {
+                name: "meet_voxel",
+                state: "VoxelHit",
+                layer: Layer::Voxel,
+                enter: "",
+                step: "if (value > (*state).above && t0 < t1) {
+                *state = VoxelHit(true, (*state).above, t0, brick, cell, value);
                 return;
             }",
-            empty: "",
-        });
-        let voxel_depth = hdda(&Body {
-            name: "add_voxels",
-            state: "f32",
-            layer: Layer::Voxel,
-            step: "if (is_active(field, voxel)) { *state += in_region(field, region, voxel) * (t1 - t0); }",
-            empty: "",
-        });
+                empty: "",
+            },
+        );
+        let nearest_steps = hdda(
+            features,
+            &Body {
+                name: "pass_voxels",
+                state: "Passing",
+                layer: Layer::Voxel,
+                enter: "(*state).number = ceil(t0 * (*state).per_step);",
+                step: "let next = ceil(t1 * (*state).per_step);
+                (*state).share *= short_power(1.0 - (*state).loss * value, next - (*state).number);
+                (*state).number = next;",
+                empty: "",
+            },
+        );
+        let voxel_depth = hdda(
+            features,
+            &Body {
+                name: "add_voxels",
+                state: "f32",
+                layer: Layer::Voxel,
+                enter: "",
+                step: "*state += value * max(t1 - t0, 0.0);",
+                empty: "",
+            },
+        );
         let sky_map = if features.sky_map[0] { file!("envmap") } else { file!("even_sky") };
         let media = if features.is_one_grid() { file!("one_grid") } else { file!("media") };
         let own: &[&str] = match self {
-            Source::Views => {
-                &[file!("camera"), file!("cells"), file!("depth"), file!("views"), &first_voxel, &voxel_depth]
-            }
+            Source::Views => &[
+                file!("camera"),
+                file!("cells"),
+                file!("depth"),
+                file!("views"),
+                &first_voxel,
+                &voxel_depth,
+                &nearest_steps,
+            ],
             Source::Surface => &[file!("camera"), file!("cells"), file!("surface")],
             Source::March => &[
                 file!("camera"),
@@ -313,6 +362,32 @@ impl Source {
     }
 }
 
+/// The shader that builds trees, into bricks of so many buffers.
+pub(crate) fn build_text(chunks: u32, log2_chunk_words: u32) -> String {
+    let features = Features { codecs: 0, chunks, log2_chunk_words, ..Features::BARE };
+    let mut text = prelude(&features);
+    for chunk in 0..chunks {
+        let binding = build::BRICKS_BINDING + chunk;
+        let _ = writeln!(
+            text,
+            "@group(0) @binding({binding}) var<storage, read_write> bricks_{chunk}: array<u32>;"
+        );
+    }
+    text += "fn set_brick_word(at: u32, word: u32) {\n";
+    let _ = writeln!(text, "    let within = at & ((1u << {log2_chunk_words}u) - 1u);");
+    let _ = writeln!(text, "    switch (at >> {log2_chunk_words}u) {{");
+    for chunk in 1..chunks {
+        let _ = writeln!(text, "        case {chunk}u: {{ bricks_{chunk}[within] = word; }}");
+    }
+    text += "        default: { bricks_0[within] = word; }\n    }\n}\n";
+    text + file!("density") + file!("build")
+}
+
+/// The shader that puts lists of voxels into dense arrays.
+pub(crate) fn scatter_text() -> String {
+    prelude(&Features::BARE) + file!("density") + file!("scatter")
+}
+
 /// Down to which layer a walk goes by itself.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Layer {
@@ -323,12 +398,15 @@ enum Layer {
     Voxel,
 }
 
-/// What a walk does: WGSL that sees `field`, `ray`, `brick`, `region`, `voxel`, `t0`, `t1` and `state`.
+/// What a walk does: WGSL that sees `field`, `ray`, `brick`, `region`, `cell`, `value`,
+/// `t0`, `t1` and `state`.
 struct Body<'a> {
     name: &'a str,
     /// The type that `state` points to.
     state: &'a str,
     layer: Layer,
+    /// Where a brick begins, before its steps; it does not see `cell` and `value`.
+    enter: &'a str,
     /// At each step; `return;` ends the walk.
     step: &'a str,
     /// In each empty region.
@@ -336,16 +414,17 @@ struct Body<'a> {
 }
 
 /// A walk with its body put in, so that nothing is called.
-fn hdda(body: &Body<'_>) -> String {
+fn hdda(features: &Features, body: &Body<'_>) -> String {
     let layer = match body.layer {
         #[cfg(test)]
         Layer::Brick => "BRICK_LAYER",
         Layer::Voxel => "VOXEL_LAYER",
     };
-    file!("hdda")
-        .replace("$NAME", body.name)
+    let walk = if features.has_maps { file!("hdda_map") } else { file!("hdda") };
+    walk.replace("$NAME", body.name)
         .replace("$STATE", body.state)
         .replace("$LAYER", layer)
+        .replace("$ENTER", body.enter)
         .replace("$STEP", body.step)
         .replace("$EMPTY", body.empty)
 }
@@ -527,6 +606,12 @@ fn prelude(features: &Features) -> String {
         p.u(name, i);
     }
     p.u("ABSENT_TAG", ABSENT_TAG);
+    p.u("NODE4_TILE_TAG", maps::TILE_TAGS[0]);
+    p.u("NODE5_TILE_TAG", maps::TILE_TAGS[1]);
+    p.u("MAP_CELL_WORDS", maps::CELL_WORDS);
+    p.u("VIEW", features.view);
+    p.b("ARE_DENSITIES", features.are_densities);
+    p.b("HAS_MAPS", features.has_maps);
     p.u("NODE_TAG", Entry::NODE);
     p.u("CONSTANT_TAG", Codec::Constant.tag());
     p.u("BOUND_SIGN", bounds::SIGN);
@@ -534,6 +619,22 @@ fn prelude(features: &Features) -> String {
     p.u("BOUND_DROPPED_BITS", bounds::DROPPED_BITS);
     p.u("BRICK_LAYER", 1u32);
     p.u("VOXEL_LAYER", 0u32);
+
+    p.u("LANES", build::LANES);
+    p.u("COUNT_WORDS", build::COUNT_WORDS);
+    p.u("NODE_INFO_ROWS", build::NODE_INFO_ROWS);
+    p.u("NODE_INFO_WORDS", build::NODE_INFO_WORDS);
+    p.u("NODE4_MASK_WORDS", NODE4_SLOTS / 32);
+    p.u("NODE5_MASK_WORDS", NODE5_SLOTS / 32);
+    p.u("NODE4_MOST_WORDS", mask::most_words(NODE4_SLOTS));
+    p.u("BRICK_VOXELS", BRICK_VOXELS);
+    p.u("FIELD_WORDS", size_of::<Field>() / 4);
+    p.u("FIELD_BOUNDS_UNIT", offset_of!(Field, bounds_min) / 4 + 3);
+    p.u("FIELD_CELL_COUNT", offset_of!(Field, box_first) / 4 + 3);
+    p.u("MEANS_FOG", build::MEANS_FOG);
+    p.u("MEANS_SURFACE", build::MEANS_SURFACE);
+    p.u("MIN_F32_BITS", f32::MIN_POSITIVE.to_bits());
+    p.u("ONE", 1.0_f32.to_bits());
 
     p.f("HALF_SUBNORMAL_STEP", f32_from_finite_f16(1));
     p.u("LAST_UNIFORM_TAG", Codec::Uniform { bits: 8 }.tag());
@@ -555,6 +656,8 @@ fn prelude(features: &Features) -> String {
         .iter()
         .enumerate()
         .for_each(|(i, name)| p.b(&format!("HAS_{name}"), features.codecs >> i & 1 == 1));
+    let plain = codec_bit(Codec::F32) | codec_bit(Codec::F16) | codec_bit(Codec::Uniform { bits: 3 });
+    p.b("HAS_OTHER_CODECS", features.codecs & !plain != 0);
     p.b("HAS_TEXTURES", features.textures != 0);
     p.u("BC7_MODES", tables::BC7_MODES);
     p.u("BC7_WEIGHTS", tables::BC7_WEIGHTS);
@@ -615,8 +718,17 @@ fn prelude(features: &Features) -> String {
     p.f("UPSAMPLE_TOLERANCE", real_time::UPSAMPLE_TOLERANCE);
     p.f("KEPT_TOLERANCE", real_time::KEPT_TOLERANCE);
     p.b("ENCODES_SRGB", features.encodes_srgb);
-    for (i, name) in
-        ["VIEW_DENSITY", "VIEW_DEPTH", "VIEW_INDEX", "VIEW_FIRST_DENSITY", "VIEW_HITS"].iter().enumerate()
+    for (i, name) in [
+        "VIEW_DENSITY",
+        "VIEW_DEPTH",
+        "VIEW_INDEX",
+        "VIEW_FIRST_DENSITY",
+        "VIEW_HITS",
+        "VIEW_NEAREST",
+        "VIEW_TRILINEAR",
+    ]
+    .iter()
+    .enumerate()
     {
         p.u(name, i);
     }
@@ -653,7 +765,7 @@ mod tests {
         let tricubic = Features { lookup: Lookup::Tricubic, glow_channel: Some(0), ..Features::BARE };
         validate(&probe());
         let textures = Features { textures: 7, ..Features::ALL };
-        let depth = Features { has_depth: true, chunks: 4, textures: 4, ..Features::ALL };
+        let depth = Features { has_depth: true, chunks: 4, textures: 4, counts: true, ..Features::ALL };
         let real_time = Features { is_real_time: true, has_light_volume: true, ..tricubic };
         let cut = Features { has_depth: true, has_exact_shadows: true, ..real_time };
         for features in [Features::ALL, Features::BARE, tricubic, textures, depth, real_time, cut] {
@@ -663,6 +775,14 @@ mod tests {
                 assert!(text.contains(&format!("fn {}(", source.entry_point())), "{source:?}");
             }
         }
+        for chunks in [1, 4] {
+            let text = build_text(chunks, 25);
+            validate(&text);
+            for step in build::STEPS {
+                assert!(text.contains(&format!("fn {step}(")), "{step}");
+            }
+        }
+        validate(&scatter_text());
     }
 
     #[test]
@@ -671,11 +791,12 @@ mod tests {
             name: "count",
             state: "vec2<u32>",
             layer: Layer::Brick,
+            enter: "",
             step: "(*state).x += 1u;",
             empty: "(*state).y += 1u;",
         };
         let all = Features::ALL;
-        validate(&(Source::Views.text(&all) + &hdda(&body)));
+        validate(&(Source::Views.text(&all) + &hdda(&all, &body)));
     }
 
     #[test]

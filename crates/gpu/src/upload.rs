@@ -40,6 +40,8 @@ pub struct Volume {
 struct Summary {
     origin: DVec3,
     codecs: u32,
+    has_maps: bool,
+    are_densities: bool,
     frames: usize,
     channels: usize,
     /// Of each channel.
@@ -54,7 +56,7 @@ pub(crate) type Content = (wgpu::BindGroup, u64);
 /// The memory that a volume takes on its device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SizeBytes {
-    /// Nodes, masks and entries.
+    /// Nodes, masks, entries and maps of bricks.
     pub trees: u64,
     /// Bricks and shapes.
     pub bricks: u64,
@@ -106,9 +108,8 @@ impl Volume {
     /// If that is more than the device takes, or it fails.
     pub(crate) fn with_room(gpu: &Gpu, room: Room) -> Result<Volume, GpuError> {
         let size_bytes = Volume::size_of(gpu, room)?;
-        let limits = gpu.device().limits();
-        let binding = limits.max_storage_buffer_binding_size.min(limits.max_buffer_size);
-        let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST;
+        let binding = most_bytes(gpu);
+        let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::COPY_SRC;
         let within = |what, size_bytes: u64, limit_bytes| match size_bytes <= limit_bytes {
             true => Ok(()),
             false => Err(GpuError::Limit { what, size_bytes, limit_bytes }),
@@ -199,6 +200,8 @@ impl Volume {
         self.arrays = Summary {
             origin: arrays.origin(),
             codecs: arrays.codecs(),
+            has_maps: arrays.has_maps(),
+            are_densities: arrays.are_densities(),
             frames: arrays.frames(),
             channels: arrays.channels(),
             largest: (0..arrays.channels()).map(|channel| arrays.largest(channel)).collect(),
@@ -244,9 +247,29 @@ impl Volume {
         self.arrays.codecs
     }
 
+    /// Whether all values mean themselves.
+    pub(crate) fn are_densities(&self) -> bool {
+        self.arrays.are_densities
+    }
+
+    /// Whether bricks are looked up in maps.
+    pub(crate) fn has_maps(&self) -> bool {
+        self.arrays.has_maps
+    }
+
     /// How many buffers hold bricks, and log2 of the words of each.
     pub(crate) fn chunks(&self) -> (u32, u32) {
         (self.bricks.len() as u32, self.log2_chunk_words)
+    }
+
+    /// The buffers of the tree, of fields, and of bricks.
+    pub(crate) fn parts(&self) -> (&wgpu::Buffer, &wgpu::Buffer, &[wgpu::Buffer]) {
+        (&self.tree, &self.fields, &self.bricks)
+    }
+
+    /// Says what the largest value of each channel turned out to be.
+    pub(crate) fn set_largest(&mut self, largest: impl Iterator<Item = f32>) {
+        self.arrays.largest = largest.collect();
     }
 
     /// The buffers of the tree and of bricks, for tests of what happens if they hold anything.
@@ -269,6 +292,12 @@ impl Volume {
     pub(crate) fn place(&self, frame: usize, channel: usize) -> Option<&Place> {
         self.arrays.places.get(frame * self.arrays.channels + channel)?.as_ref()
     }
+}
+
+/// The most bytes that can be bound at once.
+pub(crate) fn most_bytes(gpu: &Gpu) -> u64 {
+    let limits = gpu.device().limits();
+    limits.max_storage_buffer_binding_size.min(limits.max_buffer_size)
 }
 
 /// A binding of a storage buffer.

@@ -29,7 +29,7 @@ fn a_lost_device_is_an_error() {
         assert_eq!(renderer.pixels().map(drop), Err(GpuError::Lost), "{whose}");
         assert_eq!(gpu.wait(), Err(GpuError::Lost), "{whose}");
         assert_eq!(Volume::new(&gpu, &arrays).map(drop), Err(GpuError::Lost), "{whose}");
-        let nothing = renderer.prepare(&volume, &look, &Pass::Hits, 0, None);
+        let nothing = renderer.prepare(&volume, &look, &Pass::Hits { above: 0.0 }, 0, None);
         assert!(matches!(nothing, Ok(()) | Err(GpuError::Lost)), "{whose}: {nothing:?}");
         let nothing = Renderer::new(&gpu, [8, 8]).map(drop);
         assert!(matches!(nothing, Ok(()) | Err(GpuError::Lost)), "{whose}: {nothing:?}");

@@ -268,7 +268,10 @@ fn what_makes_no_sense_is_an_error() {
     let prepared = renderer.prepare(&volume, &look, &Pass::March(Quality::default()), 0, None);
     assert!(matches!(prepared, Err(GpuError::Unsupported { .. })), "{prepared:?}");
     assert!(matches!(renderer.run(&volume), Err(GpuError::Misuse(_))), "nothing was prepared");
-    assert!(matches!(renderer.prepare(&volume, &look, &Pass::Hits, 1, None), Err(GpuError::Misuse(_))));
+    assert!(matches!(
+        renderer.prepare(&volume, &look, &Pass::Hits { above: 0.0 }, 1, None),
+        Err(GpuError::Misuse(_))
+    ));
 }
 
 /// Moves a pointer by some words, nodes or cells.
@@ -342,4 +345,32 @@ fn damaged_volumes_are_refused() {
     let arrays = Arrays::of_asset(&without, &wanted, 0..1, Bricks::AsStored);
     assert!(matches!(arrays, Err(GpuError::Malformed(_))), "{:?}", arrays.map(drop));
     assert!(matches!(Arrays::of_asset(&asset, &wanted, 3..4, Bricks::AsStored), Err(GpuError::Misuse(_))));
+}
+
+/// What shaders count is what a walk does: at a block that fills the picture each ray looks some things up, and beside a
+/// volume none does.
+#[test]
+fn look_ups_are_counted_and_pictures_timed() {
+    let Some(gpu) = gpu() else { return };
+    let channel = common::cloud();
+    let volume = uploaded(&gpu, &[&channel]);
+    let mut look = Look::of_scene(&lit(&channel)).expect("a look");
+    let mut renderer = Renderer::new(&gpu, [32, 18]).expect("a renderer");
+    let pass = Pass::View(nuage_render::views::View::Depth);
+    renderer.prepare(&volume, &look, &pass, 0, None).expect("a pass");
+    let took = nuage_gpu::measure::time(&gpu, &mut renderer, &volume).expect("a time");
+    assert!(took.wall.as_nanos() > 0);
+    assert!(took.device.is_none_or(|device| device.as_nanos() > 0 && device <= took.wall), "{took:?}");
+    let before = renderer.pixels().expect("pixels");
+    let counts = renderer.count(&volume, &look, &pass, 0).expect("counts");
+    let pixels = 32 * 18;
+    println!("{counts:?} of {pixels} pixels");
+    assert!(counts.rays > pixels / 4 && counts.rays <= pixels, "one walk at most for each pixel: {counts:?}");
+    assert!(counts.regions >= counts.rays && counts.values > 0, "{counts:?}");
+    renderer.prepare(&volume, &look, &pass, 0, None).expect("a pass");
+    renderer.run(&volume).expect("a run");
+    assert_eq!(renderer.pixels().expect("pixels"), before, "counting leaves pictures as they are");
+    look.camera.forward = -look.camera.forward;
+    let counts = renderer.count(&volume, &look, &pass, 0).expect("counts");
+    assert_eq!((counts.rays, counts.regions, counts.values), (0, 0, 0), "it is behind the camera");
 }

@@ -12,8 +12,9 @@ use nuage_gpu::renderer::Renderer;
 use nuage_gpu::upload::Volume as GpuVolume;
 use nuage_pipeline::pack::options::Options;
 use nuage_render::color::Blackbody;
+use nuage_render::depth::stepped_transmittance;
 use nuage_render::film::Image;
-use nuage_render::filter::Lookup;
+use nuage_render::filter::{Filter, Lookup};
 use nuage_render::lod::coarser_by;
 use nuage_render::march::Quality;
 use nuage_render::scene::{Emission, Scene, Spectrum};
@@ -45,8 +46,21 @@ fn hold_views(name: &str, renderer: &mut Renderer, volume: &GpuVolume, channel: 
             &reference.pixels,
         );
     }
-    let hits = picture(renderer, volume, &look, &Pass::Hits, 0);
+    let hits = picture(renderer, volume, &look, &Pass::Hits { above: 0.0 }, 0);
     let mut reader = field.reader();
+    for filter in [Filter::Nearest, Filter::Trilinear] {
+        let extinction = scene.volumes[0].extinction[0];
+        let pass = Pass::Opacity { filter, step_voxels: 0.5 };
+        let ours = picture(renderer, volume, &look, &pass, 0);
+        let reference: Vec<[f32; 4]> = (0..WIDTH * HEIGHT)
+            .map(|i| {
+                let pixel = DVec2::new(f64::from(i % WIDTH), f64::from(i / WIDTH)) + 0.5;
+                let ray = scene.camera.ray(pixel, WIDTH, HEIGHT);
+                [1.0 - stepped_transmittance(&field, &mut reader, &ray, filter, 0.5, extinction); 4]
+            })
+            .collect();
+        hold(&format!("{name}, steps, {filter:?}"), &ours, &reference);
+    }
     let (mut same, mut met) = (0, 0);
     for (i, hit) in (0..).zip(&hits) {
         let pixel = DVec2::new(f64::from(i % WIDTH), f64::from(i / WIDTH)) + 0.5;

@@ -217,7 +217,7 @@ fn nothing_stays_that_is_gone() {
         let gone: Vec<usize> = (0..new.len()).filter(|i| old[*i][3] > 0.1 && is_clear(*i)).collect();
         assert!(gone.len() > 100, "{}", gone.len());
         let alone = [0; 3].map(|_| errors(&picture(renderer, &volume, &look, &pass, 1), &new)[1]);
-        renderer.prepare(&volume, &look, &Pass::Hits, 0, None).expect("a pass");
+        renderer.prepare(&volume, &look, &Pass::Hits { above: 0.0 }, 0, None).expect("a pass");
         (0..4).for_each(|_| drop(picture(renderer, &volume, &look, &pass, 0)));
         renderer.set_frame(&volume, 1).expect("a frame");
         for alone in alone {
@@ -255,7 +255,7 @@ fn moving_cameras_find_the_medium_again() {
         let distance = (look.camera.origin - DVec3::new(100.0, -20.0, 5.0)).length();
         let aside = look.camera.right * 0.002 * distance;
         let mut last = Vec::new();
-        renderer.prepare(&volume, &look, &Pass::Hits, 0, None).expect("a pass");
+        renderer.prepare(&volume, &look, &Pass::Hits { above: 0.0 }, 0, None).expect("a pass");
         for _ in 0..8 {
             look.camera.origin += aside;
             last = shown(renderer, &volume, &look, COARSE, measures);

@@ -35,5 +35,5 @@ fn marched_offset() -> vec2<u32> {
 }
 
 fn store(pixel: vec2<u32>, value: vec4<f32>) {
-    picture[pixel.y * params.size.x + pixel.x] = value;
+    picture[pixel.y * params.size.x + pixel.x] = shown(value);
 }

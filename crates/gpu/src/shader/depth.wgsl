@@ -28,7 +28,7 @@ fn line_integral(field: u32, local: LocalRay, end: f32) -> f32 {
                 if (half <= 0.0) {
                     continue;
                 }
-                let first = corner + vec3<f32>(cell.local);
+                let first = corner + vec3<f32>(local_of(cell.packed));
                 let c = corners_of(field, &accessor, vec3<i32>(first) + base_voxel(field));
                 let middle = ray_at(local, 0.5 * (cell.t0 + cell.t1)) - first;
                 let apart = local.direction * (half * GAUSS_NODE);
@@ -44,10 +44,23 @@ fn line_integral(field: u32, local: LocalRay, end: f32) -> f32 {
     return sum;
 }
 
+// Where a ray is in the boxes around the active voxels, whose places it takes half a voxel further on.
+fn voxels_interval(field: u32, ray: LocalRay) -> vec2<f32> {
+    if (fields[field].box_first.w == 0) {
+        return vec2<f32>(0.0, 0.0);
+    }
+    return interval_in(ray, fields[field].bounds_min.xyz + 1.0, fields[field].bounds_max.xyz);
+}
+
+// A ray in the positions of a field, half a voxel further on.
+fn in_voxels(ray: LocalRay) -> LocalRay {
+    return LocalRay(ray.origin + 0.5, ray.direction, ray.inverse);
+}
+
 // The same of the nearest voxels, each a box around its place.
 fn voxel_integral(field: u32, local: LocalRay) -> f32 {
-    let ray = local_ray(local.origin + 0.5, local.direction);
-    let span = field_interval(field, ray, 0.0);
+    let ray = in_voxels(local);
+    let span = voxels_interval(field, ray);
     var sum = 0.0;
     if (span.x < span.y) {
         add_voxels(field, ray, span.x, span.y, &sum);

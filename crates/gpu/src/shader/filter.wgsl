@@ -3,6 +3,7 @@
 // Positions count voxels from the first voxel of the field's base brick.
 
 fn in_region(field: u32, region: Region, index: vec3<i32>) -> f32 {
+    count_value();
     let tag = tag_of(region.entry);
     if (tag == ABSENT_TAG) {
         return 0.0;

@@ -1,18 +1,20 @@
-// The walk with a body given when the shader is made: what to do at each step, in empty space, and the layer at which to
-// stop. Capitals behind a dollar sign are put in from Rust; a body sees all names below, and ends the walk by `return`.
+// The walk with a body given when the shader is made: what to do when bricks begin, at each step, and in empty space, and the
+// layer at which to stop. Capitals behind a dollar sign are put in from Rust; a body sees all names below, and ends the walk by `return`.
 
 fn $NAME(field: u32, ray: LocalRay, begin: f32, end: f32, state: ptr<function, $STATE>) {
     var accessor = new_accessor();
     var runs = runs_between(field, ray, begin, end);
+    let values = values_of(field);
     while (runs.t < runs.t_end) {
         let brick = runs.brick;
         let region = region_at(field, &accessor, brick);
         let t0 = runs.t;
-        pass_region(&runs, region.log2_bricks);
+        pass_region(&runs, region);
         let t1 = min(runs.t, runs.t_end);
-        if (tag_of(region.entry) == ABSENT_TAG) {
+        let tag = tag_of(region.entry);
+        if (tag == ABSENT_TAG) {
             $EMPTY
-            if (region.log2_bricks == LOG2_NODE5_BRICKS) {
+            if (!HAS_MAPS && region.log2_bricks == LOG2_NODE5_BRICKS) {
                 leap_to_root_entry(&runs);
             }
             continue;
@@ -20,20 +22,21 @@ fn $NAME(field: u32, ray: LocalRay, begin: f32, end: f32, state: ptr<function, $
         if (t0 >= t1) {
             continue;
         }
-        if ($LAYER == BRICK_LAYER || tag_of(region.entry) == CONSTANT_TAG) {
-            let voxel = cell_in(brick, region, field, ray, t0);
+        $ENTER
+        if ($LAYER == BRICK_LAYER || tag == CONSTANT_TAG) {
+            let cell = cells_between(ray, t0, t1, corner_of(field, brick)).packed;
+            let value = select(0.0, meant(field, bitcast<f32>(region.entry.payload)), tag == CONSTANT_TAG);
             $STEP
             continue;
         }
-        var cells = cells_between(ray, t0, t1, vec3<f32>(brick - fields[field].base_brick.xyz) * BRICK_SIDE);
+        let words = brick_of(values, region.entry);
+        var cells = cells_between(ray, t0, t1, corner_of(field, brick));
         while (cells.t < t1) {
-            let cell = next_cell(&cells);
-            if (cell.t0 >= cell.t1) {
-                continue;
-            }
-            let voxel = (brick << vec3<u32>(LOG2_BRICK)) + cell.local;
-            let t0 = cell.t0;
-            let t1 = cell.t1;
+            let here = next_cell(&cells);
+            let cell = here.packed;
+            let value = brick_value(field, values, words, offset_of(cell));
+            let t0 = here.t0;
+            let t1 = here.t1;
             $STEP
         }
     }

@@ -42,8 +42,8 @@ fn first_hit(field: u32, ray: LocalRay, end: f32, surface: f32) -> f32 {
         let bounds = footprint(field, brick, region);
         let begin = runs.t;
         if (bounds.y < surface) {
-            pass_region(&runs, region.log2_bricks);
-            if (bounds.y == 0.0 && region.log2_bricks == LOG2_NODE5_BRICKS) {
+            pass_region(&runs, region);
+            if (!HAS_MAPS && bounds.y == 0.0 && region.log2_bricks == LOG2_NODE5_BRICKS) {
                 leap_to_root_entry(&runs);
             }
             continue;
@@ -53,14 +53,14 @@ fn first_hit(field: u32, ray: LocalRay, end: f32, surface: f32) -> f32 {
         }
         // Bricks of a large tile one by one: only those at its border matter.
         step_brick(&runs);
-        let corner = vec3<f32>(brick - fields[field].base_brick.xyz) * BRICK_SIDE;
+        let corner = corner_of(field, brick);
         var cells = cells_between(ray, begin, min(runs.t, runs.t_end), corner);
         while (cells.t < cells.end) {
             let cell = next_cell(&cells);
             if (cell.t0 >= cell.t1) {
                 continue;
             }
-            let first = corner + vec3<f32>(cell.local);
+            let first = corner + vec3<f32>(local_of(cell.packed));
             let c = corners_of(field, &accessor, vec3<i32>(first) + base_voxel(field));
             if (surface_value(c, ray.origin - first, ray.direction, cell.t1, surface) >= 0.0) {
                 return meet_in_cell(c, ray.origin - first, ray.direction, cell.t0, cell.t1, surface);
@@ -95,7 +95,7 @@ fn surface(@builtin(global_invocation_id) id: vec3<u32>) {
     if (span.x < span.y) {
         t = first_hit(field, local, span.y - span.x, params.view.w);
     }
-    if (params.counts.z == VIEW_HITS) {
+    if (VIEW == VIEW_HITS) {
         store(id.xy, vec4<f32>(select(-1.0, span.x + t, t >= 0.0), 0.0, 0.0, 0.0));
         return;
     }

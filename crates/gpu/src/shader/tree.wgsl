@@ -15,8 +15,9 @@ fn tag_of(entry: Entry) -> u32 {
     return entry.kind & 0xffu;
 }
 
-// What stands at a brick: the entry of the aligned cube of `1 << log2_bricks` bricks per axis around it.
-struct Region { log2_bricks: u32, entry: Entry }
+// What stands at a brick: the entry of the aligned cube of `1 << log2_bricks` bricks per axis around it, and how many bricks beyond
+// that hold nothing either.
+struct Region { log2_bricks: u32, margin: i32, entry: Entry }
 
 fn half_word(words_at: u32, i: u32) -> u32 {
     return (tree[words_at + (i >> 1u)] >> ((i & 1u) * 16u)) & 0xffffu;
@@ -53,10 +54,6 @@ struct Accessor { key5: vec3<i32>, node5: u32, key4: vec3<i32>, node4: u32 }
 
 fn new_accessor() -> Accessor {
     return Accessor(vec3<i32>(0), NONE, vec3<i32>(0), NONE);
-}
-
-fn absent(log2_bricks: u32) -> Region {
-    return Region(log2_bricks, Entry(0u, ABSENT_TAG));
 }
 
 fn is_before(a: vec3<i32>, b: vec3<i32>) -> bool {
@@ -104,27 +101,52 @@ fn node5_slot(brick: vec3<i32>) -> u32 {
     return (local.x << 10u) | (local.y << 5u) | local.z;
 }
 
+// The region around a brick by the field's map: nuage_gpu::maps.
+fn mapped_region(field: u32, brick: vec3<i32>) -> Region {
+    let box_first = fields[field].box_first.xyz;
+    let local = vec3<u32>(brick - box_first + 1);
+    let size = vec3<u32>(fields[field].box_last.xyz - box_first + 3);
+    if (any(local >= size)) {
+        return Region(0u, 0, Entry(0u, ABSENT_TAG));
+    }
+    let at = u32(fields[field].box_last.w) + MAP_CELL_WORDS * ((local.x * size.y + local.y) * size.z + local.z);
+    let kind = tree[at];
+    let tag = kind & 0xffu;
+    if (tag == ABSENT_TAG) {
+        return Region(0u, max(i32(kind >> 8u), 1) - 1, Entry(0u, ABSENT_TAG));
+    }
+    let is_node4 = tag == NODE4_TILE_TAG;
+    let is_node5 = tag == NODE5_TILE_TAG;
+    let log2_bricks = select(select(0u, LOG2_NODE5_BRICKS, is_node5), LOG2_NODE4_BRICKS, is_node4);
+    let shown = select(kind, (kind & ~0xffu) | CONSTANT_TAG, is_node4 || is_node5);
+    return Region(log2_bricks, 0, Entry(tree[at + 1u], shown));
+}
+
 // The region around a brick.
 fn region_at(field: u32, accessor: ptr<function, Accessor>, brick: vec3<i32>) -> Region {
+    count_region();
+    if (HAS_MAPS) {
+        return mapped_region(field, brick);
+    }
     let key4 = brick >> vec3<u32>(LOG2_NODE4_BRICKS);
     if ((*accessor).node4 == NONE || any((*accessor).key4 != key4)) {
         let key5 = brick >> vec3<u32>(LOG2_NODE5_BRICKS);
         if ((*accessor).node5 == NONE || any((*accessor).key5 != key5)) {
             let root = root_entry(field, key5);
             if (tag_of(root) != NODE_TAG) {
-                return Region(LOG2_NODE5_BRICKS, root);
+                return Region(LOG2_NODE5_BRICKS, 0, root);
             }
             (*accessor).key5 = key5;
             (*accessor).node5 = root.payload;
         }
         let entry = node_entry(NODE5S, (*accessor).node5, NODE5_SUMMARY_WORDS, node5_slot(brick));
         if (tag_of(entry) != NODE_TAG) {
-            return Region(LOG2_NODE4_BRICKS, entry);
+            return Region(LOG2_NODE4_BRICKS, 0, entry);
         }
         (*accessor).key4 = key4;
         (*accessor).node4 = entry.payload;
     }
-    return Region(0u, node_entry(NODE4S, (*accessor).node4, NODE4_SUMMARY_WORDS, node4_slot(brick)));
+    return Region(0u, 0, node_entry(NODE4S, (*accessor).node4, NODE4_SUMMARY_WORDS, node4_slot(brick)));
 }
 
 // A value as it is stored, as the field means it.

@@ -1,20 +1,83 @@
 // The debug views: nuage_render::views, with the first voxel and the line integral that they show.
 
-// The first voxel of a value above 0, whose box around its place the ray enters at a distance.
-struct VoxelHit { is_there: bool, distance: f32, voxel: vec3<i32>, value: f32 }
+// The first voxel of a value above another, whose box around its place the ray enters at a distance; the cell is its place in
+// a brick.
+struct VoxelHit { is_there: bool, above: f32, distance: f32, brick: vec3<i32>, cell: u32, value: f32 }
 
-fn first_voxel(field: u32, ray: Ray) -> VoxelHit {
-    var hit = VoxelHit(false, 0.0, vec3<i32>(0), 0.0);
-    // Voxels are boxes around their places.
-    let whole = in_field(field, ray);
-    let span = field_interval(field, local_ray(whole.origin + 0.5, whole.direction), 0.0);
+fn voxel_of(hit: VoxelHit) -> vec3<i32> {
+    return (hit.brick << vec3<u32>(LOG2_BRICK)) + local_of(hit.cell);
+}
+
+fn first_voxel(field: u32, ray: Ray, above: f32) -> VoxelHit {
+    var hit = VoxelHit(false, above, 0.0, vec3<i32>(0), 0u, 0.0);
+    let span = voxels_interval(field, in_voxels(in_field(field, ray)));
     if (span.x >= span.y) {
         return hit;
     }
-    let near = moved(field, ray, span.x);
-    meet_voxel(field, local_ray(near.origin + 0.5, near.direction), 0.0, span.y - span.x, &hit);
+    meet_voxel(field, in_voxels(moved(field, ray, span.x)), 0.0, span.y - span.x, &hit);
     hit.distance += span.x;
     return hit;
+}
+
+// Light that passes samples at whole multiples of a step, the first of which is at 0; and the number of the next of them.
+struct Passing { share: f32, per_step: f32, loss: f32, number: f32 }
+
+// The power of up to seven samples in one voxel.
+fn short_power(base: f32, exponent: f32) -> f32 {
+    let count = u32(exponent);
+    let square = base * base;
+    return select(1.0, base, (count & 1u) != 0u) * select(1.0, square, (count & 2u) != 0u)
+        * select(1.0, square * square, (count & 4u) != 0u);
+}
+
+// A power of a whole exponent.
+fn power(base: f32, exponent: u32) -> f32 {
+    var result = 1.0;
+    var factor = base;
+    for (var left = exponent; left > 0u; left >>= 1u) {
+        result *= select(1.0, factor, (left & 1u) != 0u);
+        factor *= factor;
+    }
+    return result;
+}
+
+// The share of light that passes samples: nuage_render::depth::stepped_transmittance.
+fn stepped_transmittance(field: u32, ray: Ray) -> f32 {
+    let is_nearest = VIEW == VIEW_NEAREST;
+    let whole = in_field(field, ray);
+    var span = field_interval(field, whole, 0.0);
+    if (is_nearest) {
+        span = voxels_interval(field, in_voxels(whole));
+    }
+    if (span.x >= span.y) {
+        return 1.0;
+    }
+    let step = params.march.x / length(whole.direction);
+    let start = ceil(span.x / step) * step;
+    let local = moved(field, ray, start);
+    var passing = Passing(1.0, 1.0 / step, params.media[0].extinction.x * step, 0.0);
+    if (is_nearest) {
+        pass_voxels(field, in_voxels(local), 0.0, span.y - start, &passing);
+        return passing.share;
+    }
+    var accessor = new_accessor();
+    var runs = runs_between(field, local, 0.0, span.y - start);
+    loop {
+        let found = next_run(&runs, &accessor);
+        if (!found.is_there) {
+            break;
+        }
+        var number = ceil(found.run.t0 * passing.per_step);
+        let end = ceil(found.run.t1 * passing.per_step);
+        if (found.run.is_varying) {
+            for (; number < end; number += 1.0) {
+                passing.share *= 1.0 - passing.loss * trilinear(field, &accessor, ray_at(local, number * step));
+            }
+        } else {
+            passing.share *= power(1.0 - passing.loss * found.run.value, u32(max(end - number, 0.0)));
+        }
+    }
+    return passing.share;
 }
 
 // The integral of the interpolated field along a ray in the world.
@@ -27,7 +90,7 @@ fn whole_integral(field: u32, ray: Ray) -> f32 {
 }
 
 fn view_colour(hit: VoxelHit, field: u32) -> vec3<f32> {
-    switch (params.counts.z) {
+    switch (VIEW) {
         case VIEW_DEPTH: {
             let share = (hit.distance - params.view.x) / (params.view.y - params.view.x);
             return vec3<f32>(clamp(1.0 - share, 0.0, 1.0));
@@ -35,7 +98,7 @@ fn view_colour(hit: VoxelHit, field: u32) -> vec3<f32> {
         case VIEW_INDEX: {
             let first = fields[field].active_min.xyz;
             let size = fields[field].active_max.xyz - first + 1;
-            let local = max(hit.voxel - first, vec3<i32>(0));
+            let local = max(voxel_of(hit) - first, vec3<i32>(0));
             let side = f32(max(size.x, max(size.y, size.z)));
             // Nested, so that single precision suffices.
             let turns = (f32(local.z) + (f32(local.y) + f32(local.x) / side) / side) / side;
@@ -54,14 +117,18 @@ fn views(@builtin(global_invocation_id) id: vec3<u32>) {
     }
     let field = field_of(DENSITY_CHANNEL);
     let ray = camera_ray(vec2<f32>(id.xy) + 0.5);
-    if (params.counts.z == VIEW_DENSITY) {
+    if (VIEW == VIEW_DENSITY) {
         store(id.xy, vec4<f32>(one_minus_exp_neg(params.media[0].extinction.x * whole_integral(field, ray))));
         return;
     }
-    let hit = first_voxel(field, ray);
-    if (params.counts.z == VIEW_HITS) {
+    if (VIEW == VIEW_NEAREST || VIEW == VIEW_TRILINEAR) {
+        store(id.xy, vec4<f32>(1.0 - stepped_transmittance(field, ray)));
+        return;
+    }
+    let hit = first_voxel(field, ray, params.view.w);
+    if (VIEW == VIEW_HITS) {
         let distance = select(-1.0, hit.distance, hit.is_there);
-        store(id.xy, vec4<f32>(distance, vec3<f32>(hit.voxel + fields[field].index_offset.xyz)));
+        store(id.xy, vec4<f32>(distance, vec3<f32>(voxel_of(hit) + fields[field].index_offset.xyz)));
         return;
     }
     var picture_value = vec4<f32>(0.0);

@@ -64,11 +64,8 @@ struct Runs {
     brick: vec3<i32>,
     t: f32,
     t_end: f32,
-    // Where the ray leaves that brick along each axis, and the distance between its faces.
-    t_next: vec3<f32>,
-    t_brick: vec3<f32>,
-    sign: vec3<i32>,
-    brick_end: vec3<i32>,
+    box_first: vec3<i32>,
+    box_last: vec3<i32>,
     root_leaps_left: u32,
     leaps_left: u32,
     // What was found and not yet given out: a varying run, one of a value, and a varying one, between these four
@@ -78,15 +75,9 @@ struct Runs {
     given: u32,
 }
 
-fn faces_at(runs: ptr<function, Runs>, brick: vec3<i32>) -> vec3<f32> {
-    let ray = (*runs).ray;
-    let t = (vec3<f32>(brick - fields[(*runs).field].base_brick.xyz) * BRICK_SIDE - ray.origin) * ray.inverse;
-    return select(t, vec3<f32>(MAX_F32), ray.direction == vec3<f32>(0.0));
-}
-
-fn aim(runs: ptr<function, Runs>) {
-    let forward = (*runs).ray.direction >= vec3<f32>(0.0);
-    (*runs).t_next = faces_at(runs, select((*runs).brick, (*runs).brick + 1, forward));
+// The position of a brick's first voxel.
+fn corner_of(field: u32, brick: vec3<i32>) -> vec3<f32> {
+    return vec3<f32>(brick - fields[field].base_brick.xyz) * BRICK_SIDE;
 }
 
 fn brick_of_position(field: u32, position: vec3<f32>) -> vec3<i32> {
@@ -95,69 +86,63 @@ fn brick_of_position(field: u32, position: vec3<f32>) -> vec3<i32> {
 
 // The runs of a ray between two distances inside the field.
 fn runs_between(field: u32, ray: LocalRay, t0: f32, t1: f32) -> Runs {
-    let forward = ray.direction >= vec3<f32>(0.0);
-    let box_first = fields[field].box_first.xyz;
-    let box_last = fields[field].box_last.xyz;
+    count_ray();
     var runs: Runs;
     runs.field = field;
     runs.ray = ray;
-    runs.brick = clamp(brick_of_position(field, ray_at(ray, t0)), box_first, box_last);
+    runs.box_first = fields[field].box_first.xyz;
+    runs.box_last = fields[field].box_last.xyz;
+    runs.brick = clamp(brick_of_position(field, ray_at(ray, t0)), runs.box_first, runs.box_last);
     runs.t = t0;
     runs.t_end = t1;
-    runs.t_brick = abs(BRICK_SIDE * ray.inverse);
-    runs.sign = select(vec3<i32>(-1), vec3<i32>(1), forward);
-    runs.brick_end = select(box_first - 1, box_last + 1, forward);
     runs.root_leaps_left = MAX_ROOT_LEAPS;
     runs.leaps_left = MAX_LEAPS;
     runs.given = 3u;
-    aim(&runs);
     return runs;
+}
+
+// Moves on to where the ray leaves the cube from one brick to another, and to the brick behind.
+fn leap(runs: ptr<function, Runs>, first: vec3<i32>, last: vec3<i32>) {
+    let ray = (*runs).ray;
+    let forward = ray.direction >= vec3<f32>(0.0);
+    let corner = corner_of((*runs).field, select(first, last + 1, forward));
+    let faces = select((corner - ray.origin) * ray.inverse, vec3<f32>(MAX_F32), ray.direction == vec3<f32>(0.0));
+    let leaves = min_component(faces);
+    let is_x = faces.x <= leaves;
+    let is_y = !is_x && faces.y <= leaves;
+    let t = max((*runs).t, leaves);
+    let within = clamp(
+        brick_of_position((*runs).field, ray_at(ray, t)), max(first, (*runs).box_first), min(last, (*runs).box_last),
+    );
+    // The axis of the exit moves by the integers, so that the walk never stands still.
+    let brick = select(within, select(first - 1, last + 1, forward), vec3<bool>(is_x, is_y, !(is_x || is_y)));
+    if (any(brick < (*runs).box_first) || any(brick > (*runs).box_last)) {
+        (*runs).t_end = min((*runs).t_end, t);
+    }
+    (*runs).t = t;
+    (*runs).brick = brick;
 }
 
 // Moves on to the next brick.
 fn step_brick(runs: ptr<function, Runs>) {
-    let next = (*runs).t_next;
-    var axis = vec3<i32>(0, 0, 1);
-    if (next.x <= next.y && next.x <= next.z) {
-        axis = vec3<i32>(1, 0, 0);
-    } else if (next.y <= next.z) {
-        axis = vec3<i32>(0, 1, 0);
-    }
-    (*runs).t = max((*runs).t, min_component(next));
-    (*runs).t_next = next + select(vec3<f32>(0.0), (*runs).t_brick, axis == vec3<i32>(1));
-    (*runs).brick += axis * (*runs).sign;
-    if (any((axis == vec3<i32>(1)) & ((*runs).brick == (*runs).brick_end))) {
-        (*runs).t_end = min((*runs).t_end, (*runs).t);
-    }
+    leap(runs, (*runs).brick, (*runs).brick);
 }
 
-// Moves on to where the ray leaves the cube of bricks around the one it is in, and to the brick behind.
-fn leap(runs: ptr<function, Runs>, log2_bricks: u32) {
-    let ray = (*runs).ray;
-    let field = (*runs).field;
-    let first = (*runs).brick & vec3<i32>(-1 << log2_bricks);
-    let last = first + ((1 << log2_bricks) - 1);
-    let forward = ray.direction >= vec3<f32>(0.0);
-    let faces = faces_at(runs, select(first, last + 1, forward));
-    var axis = vec3<bool>(false, false, true);
-    if (faces.x <= faces.y && faces.x <= faces.z) {
-        axis = vec3<bool>(true, false, false);
-    } else if (faces.y <= faces.z) {
-        axis = vec3<bool>(false, true, false);
+// Moves on to where the ray leaves a region around the brick it is in, and what is as empty around that.
+fn pass_region(runs: ptr<function, Runs>, region: Region) {
+    if (IS_WIDE) {
+        step_brick(runs);
+        return;
     }
-    (*runs).t = max((*runs).t, min_component(faces));
-    let box_first = fields[field].box_first.xyz;
-    let box_last = fields[field].box_last.xyz;
-    let within = clamp(
-        brick_of_position(field, ray_at(ray, (*runs).t)), max(first, box_first), min(last, box_last),
-    );
-    // The axis of the exit moves by the integers, so that the walk never stands still.
-    (*runs).brick = select(within, select(first - 1, last + 1, forward), axis);
-    (*runs).leaps_left -= 1u;
-    if ((*runs).leaps_left == 0u || any((*runs).brick < box_first) || any((*runs).brick > box_last)) {
-        (*runs).t_end = min((*runs).t_end, (*runs).t);
+    let side = (1 << region.log2_bricks) - 1;
+    if (side > 0) {
+        (*runs).leaps_left -= 1u;
+        if ((*runs).leaps_left == 0u) {
+            (*runs).t_end = min((*runs).t_end, (*runs).t);
+        }
     }
-    aim(runs);
+    let first = (*runs).brick & vec3<i32>(~side);
+    leap(runs, first - region.margin, first + (side + region.margin));
 }
 
 // Moves on to the next cell of the root table, over all that have none.
@@ -191,7 +176,6 @@ fn leap_to_root_entry(runs: ptr<function, Runs>) {
         return;
     }
     (*runs).brick = clamp(brick_of_position(field, ray_at((*runs).ray, next)), first, last);
-    aim(runs);
 }
 
 // Bounds of samples whose cell lies in a region around a brick; of those that reach one voxel further, in the brick.
@@ -208,14 +192,6 @@ fn sample_bounds(field: u32, brick: vec3<i32>, region: Region) -> vec2<f32> {
     return bounds;
 }
 
-fn pass_region(runs: ptr<function, Runs>, log2_bricks: u32) {
-    if (log2_bricks == 0u || IS_WIDE) {
-        step_brick(runs);
-    } else {
-        leap(runs, log2_bricks);
-    }
-}
-
 // A stretch of a ray through one region, with bounds of all that can be sampled there.
 struct Segment { is_there: bool, t0: f32, t1: f32, min: f32, max: f32 }
 
@@ -226,12 +202,12 @@ fn next_segment(runs: ptr<function, Runs>, accessor: ptr<function, Accessor>) ->
         let region = region_at((*runs).field, accessor, brick);
         let bounds = sample_bounds((*runs).field, brick, region);
         let t0 = (*runs).t;
-        pass_region(runs, region.log2_bricks);
+        pass_region(runs, region);
         let t1 = min((*runs).t, (*runs).t_end);
         if (bounds.y > 0.0 && t0 < t1) {
             return Segment(true, t0, t1, bounds.x, bounds.y);
         }
-        if (bounds.y <= 0.0 && region.log2_bricks == LOG2_NODE5_BRICKS && !IS_WIDE) {
+        if (bounds.y <= 0.0 && region.log2_bricks == LOG2_NODE5_BRICKS && !HAS_MAPS && !IS_WIDE) {
             leap_to_root_entry(runs);
         }
     }
@@ -289,14 +265,14 @@ fn next_run(runs: ptr<function, Runs>, accessor: ptr<function, Accessor>) -> Fou
         let region = region_at((*runs).field, accessor, brick);
         let bounds = sample_bounds((*runs).field, brick, region);
         let t0 = (*runs).t;
-        pass_region(runs, region.log2_bricks);
+        pass_region(runs, region);
         let t1 = min((*runs).t, (*runs).t_end);
         if (t0 >= t1) {
             continue;
         }
         if (bounds.x == bounds.y) {
             if (bounds.y == 0.0) {
-                if (region.log2_bricks == LOG2_NODE5_BRICKS && !IS_WIDE) {
+                if (region.log2_bricks == LOG2_NODE5_BRICKS && !HAS_MAPS && !IS_WIDE) {
                     leap_to_root_entry(runs);
                 }
                 if (joined.is_there) {

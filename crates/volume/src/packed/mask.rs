@@ -68,6 +68,12 @@ fn kept_words(mask: &[u32], summary_words: usize) -> usize {
     mask.iter().take(summary_words).map(|word| word.count_ones() as usize).sum()
 }
 
+/// The words that a mask of so many slots takes at most.
+pub fn most_words(slots: usize) -> usize {
+    let (summary_words, kept) = (slots / 1024, slots / 32);
+    summary_words + halves(summary_words) + kept + halves(kept)
+}
+
 /// The words that a mask takes. `None` if it does not end.
 pub fn len(masks: &[u32], begin: u32, slots: usize) -> Option<usize> {
     let mask = masks.get(begin as usize..)?;
@@ -117,6 +123,7 @@ mod tests {
             prop_assert_eq!(len(&masks, 3, count), Some(masks.len() - 4));
             let decoded = decode(&masks, 3, count);
             prop_assert_eq!(decoded.as_ref(), Some(&bits));
+            prop_assert!(masks.len() - 4 <= most_words(count));
             let mut expected = 0;
             for slot in 0..count {
                 let is_set = bits[slot / 32] >> (slot % 32) & 1 == 1;
