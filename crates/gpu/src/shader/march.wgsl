@@ -56,7 +56,7 @@ struct Lighting {
 // What shadow rays remember.
 var<private> shadow_accessor: Accessor;
 
-fn new_lighting(ray: Ray, start: f32, local: LocalRay, random: u32) -> Lighting {
+fn new_lighting(ray: Ray, start: f32, local: LocalRay, random: u32, shift: f32) -> Lighting {
     let field = field_of(SHADOW_CHANNEL);
     var lighting: Lighting;
     lighting.field = field;
@@ -74,7 +74,7 @@ fn new_lighting(ray: Ray, start: f32, local: LocalRay, random: u32) -> Lighting 
     lighting.sun_direction = directions(field, params.sun_direction.xyz);
     lighting.sky = params.sky_zenith.xyz * params.media[0].albedo.xyz;
     lighting.has_sky = any(lighting.sky != vec3<f32>(0.0)) && params.march_rays.y > 0.0;
-    lighting.next_sky = unit_f32(hash_u32(random ^ SKY_SEED)) / max(params.march_rays.y, 1.0);
+    lighting.next_sky = sky_shift(random, shift) / max(params.march_rays.y, 1.0);
     lighting.random = random;
     return lighting;
 }
@@ -246,7 +246,7 @@ fn march_radiance(ray: Ray, max_distance: f32, random: u32, shift: f32) -> vec4<
     );
     let step_length = params.march.x / voxels_per_length;
     let lattice = Lattice(step_length, fract(shift - start / step_length), 0.0);
-    var lighting = new_lighting(ray, start, local, random);
+    var lighting = new_lighting(ray, start, local, random, shift);
     lighting.has_sun = lighting.has_sun && has_density;
     lighting.has_sky = lighting.has_sky && has_density;
     let is_lit = lighting.has_sun || lighting.has_sky;

@@ -12,6 +12,12 @@ fn step_shift(marched: vec2<u32>, random: u32) -> f32 {
     return fract(noise + unit_f32(params.marched.w * GOLDEN));
 }
 
+// What part of the first ray's share is gone where it goes to the sky: as evenly spread as where steps begin, which it does
+// not depend on otherwise.
+fn sky_shift(random: u32, step_shift: f32) -> f32 {
+    return step_shift;
+}
+
 // The share of the sun's light that gets to a position of the field that shadow rays meet.
 fn cached_transmittance(position: vec3<f32>) -> f32 {
     let p = vec4<f32>(position, 1.0);
