@@ -35,7 +35,7 @@ fn brick_value(field: u32, values: Values, brick: Brick, voxel: u32) -> f32 {
             bits |= brick_word(word + 1u) << (32u - (bit & 31u));
         }
         stored = line_at(brick.line, bits & ((1u << brick.tag) - 1u));
-    } else if (HAS_OTHER_CODECS && brick.tag != CONSTANT_TAG && brick.tag != NODE4_TILE_TAG && brick.tag != NODE5_TILE_TAG) {
+    } else if (HAS_OTHER_CODECS && brick.tag != CONSTANT_TAG && brick.tag < NODE4_TILE_TAG) {
         stored = stored_value(field, Entry(at, brick.tag), vec3<u32>(voxel >> 6u, (voxel >> 3u) & 7u, voxel & 7u));
     }
     if (ARE_DENSITIES) {
