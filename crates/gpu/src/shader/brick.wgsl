@@ -23,9 +23,11 @@ fn brick_value(field: u32, values: Values, brick: Brick, voxel: u32) -> f32 {
     count_value();
     let at = brick.at;
     var stored = bitcast<f32>(at);
-    if (HAS_F32 && brick.tag == F32_TAG) {
-        stored = bitcast<f32>(brick_word(at + voxel));
-    } else if (HAS_F16 && brick.tag == F16_TAG) {
+    if (HAS_F32) {
+        // Read in any case, which is less than a branch: beyond the bricks there is some word as well.
+        stored = select(stored, bitcast<f32>(brick_word(at + voxel)), brick.tag == F32_TAG);
+    }
+    if (HAS_F16 && brick.tag == F16_TAG) {
         stored = half_value((brick_word(at + (voxel >> 1u)) >> ((voxel & 1u) * 16u)) & 0xffffu) * values.unit;
     } else if (HAS_UNIFORM && brick.tag <= LAST_UNIFORM_TAG && brick.tag != CONSTANT_TAG) {
         let bit = voxel * brick.tag;
