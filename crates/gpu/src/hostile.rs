@@ -20,12 +20,13 @@ use nuage_volume::space::BRICK_VOXELS;
 
 use crate::arrays::Arrays;
 use crate::look::{Look, Medium, MediumPlace, Pass};
+use crate::real_time::RealTime;
 use crate::renderer::Renderer;
 use crate::shader::HEADER_WORDS;
 use crate::upload::Volume;
 
 /// A block of bricks that are all there.
-fn block(bricks: i32) -> Channel {
+pub(crate) fn block(bricks: i32) -> Channel {
     let mut builder = TreeBuilder::new();
     let mut values = Vec::new();
     for i in 0..bricks.pow(3) {
@@ -39,14 +40,8 @@ fn block(bricks: i32) -> Channel {
     Channel { tree, world_from_index: DAffine3::from_scale(DVec3::splat(0.05)), active_box }
 }
 
-/// How words are changed: word `i` of a buffer, `true` if that is the tree.
-type Change = fn(u32, u32, bool) -> u32;
-
-#[test]
-fn any_words_come_to_an_end() {
-    let Some(gpu) = crate::twins::gpu() else { return };
-    let channel = block(5);
-    let arrays = Arrays::of_channels(&[&channel]).expect("arrays");
+/// What it looks like in the light of a sun and an even sky.
+pub(crate) fn look() -> Look {
     let camera = Camera::look_at(DVec3::new(5.0, 4.0, 6.0), DVec3::ONE, DVec3::Y, 30.0).expect("a view");
     let medium = Medium {
         place: MediumPlace::Channel(0),
@@ -56,7 +51,7 @@ fn any_words_come_to_an_end() {
         phase: Phase::HenyeyGreenstein { g: 0.3 },
         glow: None,
     };
-    let look = Look {
+    Look {
         camera,
         media: vec![medium],
         lights: vec![Light::Sun(Sun {
@@ -65,13 +60,27 @@ fn any_words_come_to_an_end() {
             angle_degrees: 0.0,
         })],
         sky: Sky::Constant([1.0; 3]),
-    };
+    }
+}
+
+/// How words are changed: word `i` of a buffer, `true` if that is the tree.
+type Change = fn(u32, u32, bool) -> u32;
+
+#[test]
+fn any_words_come_to_an_end() {
+    let Some(gpu) = crate::twins::gpu() else { return };
+    let channel = block(5);
+    let arrays = Arrays::of_channels(&[&channel]).expect("arrays");
+    let look = look();
     let path = Pass::Path { settings: PathSettings::default(), sample: 0 };
+    let measures = RealTime { accumulate: false, ..RealTime::default() };
     let passes = [
         Pass::View(View::Density { extinction: 1.0 }),
         Pass::View(View::Index),
         Pass::View(View::Surface { level: 0.5 }),
         Pass::March(Quality { sky_rays: 1, ..Quality::default() }),
+        Pass::RealTime { quality: Quality::default(), measures },
+        Pass::Shadow(Quality::default()),
         path,
     ];
     let changes: [(&str, Change); 4] =

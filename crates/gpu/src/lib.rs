@@ -13,18 +13,23 @@
 
 pub mod arrays;
 mod blocks;
+mod blue_noise;
+mod budget;
 pub mod build;
 pub mod device;
 pub mod error;
+mod light_volume;
 pub mod look;
 mod maps;
 pub mod measure;
 mod params;
 pub mod picture;
+pub mod real_time;
 pub mod renderer;
 mod shader;
 mod sky;
 pub mod stream;
+mod timer;
 pub mod upload;
 
 #[cfg(test)]

@@ -15,6 +15,7 @@ use nuage_volume::channel::Channel;
 use crate::error::GpuError;
 use crate::params::{LightParams, MediumParams, Params, Place, SHAPE_BALL, SHAPE_BOX, SHAPE_GRID};
 pub use crate::params::{MAX_LIGHTS, MAX_MEDIA};
+use crate::real_time::RealTime;
 use crate::shader::SOLID_CHANNEL;
 use crate::upload::Volume;
 
@@ -87,6 +88,17 @@ pub enum Pass {
     },
     /// Single scattering, as `nuage_render::march`.
     March(Quality),
+    /// Single scattering in pictures that follow each other: as [`Pass::March`], by what [`RealTime`] asks for.
+    RealTime {
+        /// How finely, where there is time.
+        quality: Quality,
+        /// By which means.
+        measures: RealTime,
+    },
+    /// The volume's shadow on a scene: the share of the sun's light that gets to each pixel of the host's depth buffer, in all
+    /// colours, with an opacity of 1. Without a depth buffer to points, which stand in the picture
+    /// ([`Renderer::set_points`](crate::renderer::Renderer::set_points)).
+    Shadow(Quality),
     /// Multiple scattering, as `nuage_render::path`: adds one path to those that each pixel has.
     ///
     /// One, so that no pass lasts long: drivers end passes of seconds, and lavapipe leaves loops after 65535 turns in all.
@@ -228,7 +240,9 @@ impl Look {
                 params.march[0] = step_voxels;
             }
             Pass::SurfaceHits { level } => (params.counts[2], params.view[3]) = (4, level),
-            Pass::March(quality) => self.march(&mut params, quality),
+            Pass::March(quality) | Pass::RealTime { quality, .. } | Pass::Shadow(quality) => {
+                self.march(&mut params, quality);
+            }
             Pass::Path { settings, sample } => {
                 params.size[3] = sample;
                 params.counts[1] = settings.max_scatterings.unwrap_or(u32::MAX);
@@ -261,11 +275,15 @@ impl Look {
             {
                 unsupported("steps of less than a quarter of a voxel")
             }
-            Pass::March(_) if !self.is_grey() => unsupported("an extinction with a colour in one scattering"),
-            Pass::March(_) if self.lights.len() > 1 || !self.lights.iter().all(is_point_sun) => {
+            Pass::March(_) | Pass::RealTime { .. } | Pass::Shadow(_) if !self.is_grey() => {
+                unsupported("an extinction with a colour in one scattering")
+            }
+            Pass::March(_) | Pass::RealTime { .. } | Pass::Shadow(_)
+                if self.lights.len() > 1 || !self.lights.iter().all(is_point_sun) =>
+            {
                 unsupported("lights other than one sun without extent in one scattering")
             }
-            Pass::March(_) if !matches!(self.sky, Sky::Constant(_)) => {
+            Pass::March(_) | Pass::RealTime { .. } if !matches!(self.sky, Sky::Constant(_)) => {
                 unsupported("a sky that is not the same from everywhere in one scattering")
             }
             _ => Ok(()),
@@ -278,6 +296,12 @@ impl Look {
             Some(Medium { place: MediumPlace::Channel(channel), .. }) => *channel,
             _ => 0,
         }
+    }
+
+    /// The channel of the densities that shadow rays meet.
+    pub(crate) fn shadow_channel(&self) -> usize {
+        let coarse = self.media.first().and_then(|medium| medium.coarse);
+        coarse.unwrap_or_else(|| self.density_channel())
     }
 
     fn view(&self, params: &mut Params, volume: &Volume, view: View, frame: usize) {
@@ -306,6 +330,7 @@ impl Look {
         let max_shadow_depth = -min_transmittance.clamp(f32::MIN_POSITIVE, 1.0).ln();
         params.march_rays = [quality.sun_rays as f32, quality.sky_rays as f32, max_shadow_depth, 0.0];
         params.counts[0] = quality.samples.max(1);
+        params.marched = [params.size[0], params.size[1], 1, 0];
         if let Some(Light::Sun(sun)) = self.lights.first() {
             params.sun_direction = sun.direction_to.extend(0.0).to_array();
             params.sun_irradiance = Vec3::from_array(sun.irradiance).extend(0.0).to_array();

@@ -85,11 +85,16 @@ impl Place {
         [first >> LOG2_BRICK, last >> LOG2_BRICK]
     }
 
+    /// The brick that positions count from.
+    pub(crate) fn base_brick(&self) -> IVec3 {
+        self.bricks()[0] - 1
+    }
+
     /// The field, in a world that begins at `origin`: as `nuage_render::traverse::Field` has it.
     pub(crate) fn field(&self, origin: DVec3) -> Field {
         let (min, max) = (self.active_box.min.saturating_sub(IVec3::ONE), self.active_box.max);
         let [first_brick, last_brick] = self.bricks();
-        let base_brick = first_brick - 1;
+        let base_brick = self.base_brick();
         let base = (base_brick << LOG2_BRICK).as_dvec3();
         let index_from_world = self.world_from_index.inverse();
         let of_origin = index_from_world.transform_point3(origin) - base;
@@ -219,6 +224,19 @@ pub(crate) struct Params {
     pub(crate) clip_y: [f32; 4],
     pub(crate) clip_z: [f32; 4],
     pub(crate) clip_w: [f32; 4],
+    pub(crate) marched: [u32; 4],
+    pub(crate) light_first: [f32; 4],
+    pub(crate) light_x: [f32; 4],
+    pub(crate) light_y: [f32; 4],
+    pub(crate) light_z: [f32; 4],
+    pub(crate) light_u: [f32; 4],
+    pub(crate) light_v: [f32; 4],
+    pub(crate) light_w: [f32; 4],
+    pub(crate) before_camera: [f32; 4],
+    pub(crate) before_forward: [f32; 4],
+    pub(crate) before_right: [f32; 4],
+    pub(crate) before_up: [f32; 4],
+    pub(crate) history: [f32; 4],
     pub(crate) map_x: [f32; 4],
     pub(crate) map_y: [f32; 4],
     pub(crate) map_z: [f32; 4],
@@ -271,8 +289,9 @@ mod tests {
         );
         assert_layout!(
             Params, "Params", camera forward right up size counts sky_up sky_zenith sky_horizon sky_ground march
-            march_rays sun_direction sun_irradiance view tone clip_x clip_y clip_z clip_w map_x map_y map_z map_size
-            media lights blackbody
+            march_rays sun_direction sun_irradiance view tone clip_x clip_y clip_z clip_w marched light_first light_x
+            light_y light_z light_u light_v light_w before_camera before_forward before_right before_up history map_x
+            map_y map_z map_size media lights blackbody
         );
     }
 }

@@ -6,19 +6,21 @@
 use std::collections::HashMap;
 use std::ops::Range;
 use std::sync::Arc;
+use std::time::Instant;
 
 use glam::DMat4;
 use nuage_render::envmap::EnvironmentMap;
 use nuage_render::filter::Lookup;
 use nuage_render::light::Sky;
-use nuage_render::march::Quality;
 use nuage_render::path::PathSettings;
 use nuage_render::views::View;
 
 use crate::device::Gpu;
 use crate::error::GpuError;
+use crate::light_volume;
 use crate::look::{Look, Medium, MediumPlace, Pass, world_from_clip};
 use crate::params::Params;
+use crate::real_time::Stages;
 use crate::shader::{Features, Source, WORKGROUP_SIDE};
 use crate::sky::{sky_group, sky_layout};
 use crate::upload::{Volume, bind, buffer_entry, storage_entry};
@@ -59,11 +61,23 @@ pub struct Renderer {
     sky: Option<(Arc<EnvironmentMap>, wgpu::BindGroup)>,
     pipelines: HashMap<(Source, Features), wgpu::ComputePipeline>,
     targets: HashMap<wgpu::TextureFormat, wgpu::RenderPipeline>,
-    /// What the next [`Renderer::record`] runs, and whether it starts from nothing.
-    prepared: Option<((Source, Features), bool)>,
+    /// What the next [`Renderer::record`] runs.
+    prepared: Option<Prepared>,
     current: Params,
     /// What of that is on the device.
     written: Option<Params>,
+    /// What pictures that follow each other need, once there is one.
+    stages: Option<Stages>,
+}
+
+/// What is to be run.
+#[derive(Debug, Clone)]
+struct Prepared {
+    key: (Source, Features),
+    /// Whether the picture begins anew.
+    is_first: bool,
+    /// The look that other frames are to be shown by, of pictures that follow each other.
+    look: Option<Look>,
 }
 
 impl Renderer {
@@ -125,6 +139,7 @@ impl Renderer {
             prepared: None,
             current: Params::default(),
             written: None,
+            stages: None,
         })
     }
 
@@ -179,9 +194,30 @@ impl Renderer {
         source: Source,
         counts: bool,
     ) -> Result<(), GpuError> {
-        let mut params = look.params(volume, pass, self.size, frame)?;
-        let features =
-            Features { counts, ..features(volume, look, pass, source, depth.is_some(), params.counts[2]) };
+        let mut pass = *pass;
+        let mut light_step_voxels = 0.0;
+        let is_real_time = matches!(pass, Pass::RealTime { .. });
+        if let Pass::RealTime { quality, measures } = &mut pass {
+            let gpu = self.gpu.clone();
+            light_step_voxels = light_volume::step_voxels(quality.shadow_step_voxels);
+            *quality = self.stages()?.ask(&gpu, *quality, *measures)?;
+        }
+        let mut params = look.params(volume, &pass, self.size, frame)?;
+        let mut has_light_volume = false;
+        match self.stages.as_mut() {
+            Some(stages) if is_real_time => {
+                // Coarser steps of a picture leave the light volume as it is.
+                params.march_rays[3] = light_step_voxels;
+                has_light_volume = stages.settle(&mut params, volume, look, frame);
+            }
+            Some(stages) => stages.forget(),
+            None => {}
+        }
+        let features = Features {
+            counts,
+            has_light_volume,
+            ..features(volume, look, &pass, source, depth.is_some(), params.counts[2])
+        };
         if let Some(depth) = depth {
             [params.clip_x, params.clip_y, params.clip_z, params.clip_w] =
                 world_from_clip(&depth.clip_from_world, volume.origin());
@@ -195,15 +231,67 @@ impl Renderer {
             self.depth = Some(self.gpu.guarded(|| self.gpu.device().create_bind_group(&descriptor))?);
         }
         let key = (source, features);
-        if !self.pipelines.contains_key(&key) {
-            let pipeline = self.pipeline(volume, source, &features)?;
-            self.pipelines.insert(key, pipeline);
+        let light_volume = has_light_volume.then_some(Source::LightVolume);
+        // Both, though a budget may never ask for the first: no picture is to wait for it then.
+        let following = [Source::Upsample, Source::Accumulate].into_iter().filter(|_| is_real_time);
+        for source in [source].into_iter().chain(light_volume).chain(following) {
+            let key = (source, features.of(source));
+            if !self.pipelines.contains_key(&key) {
+                let pipeline = self.pipeline(volume, source, &key.1)?;
+                self.pipelines.insert(key, pipeline);
+            }
         }
         self.bind_sky(look)?;
-        let is_first = !matches!(pass, Pass::Path { sample: 1.., .. });
-        self.prepared = Some((key, is_first));
+        let goes_on = matches!(pass, Pass::Path { sample: 1.., .. } | Pass::RealTime { .. });
+        let is_of_points = matches!(pass, Pass::Shadow(_)) && depth.is_none();
+        let look = is_real_time.then(|| look.clone());
+        self.prepared = Some(Prepared { key, is_first: !goes_on && !is_of_points, look });
         self.current = params;
         self.write_params()
+    }
+
+    /// What pictures that follow each other need.
+    fn stages(&mut self) -> Result<&mut Stages, GpuError> {
+        let stages = match self.stages.take() {
+            Some(stages) => stages,
+            None => {
+                let [(pass_layout, _), _] = &self.groups;
+                Stages::new(&self.gpu, self.size, pass_layout, &self.params, &self.picture)?
+            }
+        };
+        Ok(self.stages.insert(stages))
+    }
+
+    /// Sets the points whose light [`Pass::Shadow`] asks for: as many as there are pixels, counted from the place of the look's
+    /// camera, so that they are precise wherever that is.
+    ///
+    /// # Errors
+    /// If there are too many, or the device fails.
+    pub fn set_points(&self, points: &[[f32; 3]]) -> Result<(), GpuError> {
+        let [width, height] = self.size;
+        if points.len() as u64 > u64::from(width) * u64::from(height) {
+            return Err(GpuError::Misuse(format!("{} points in {width} x {height} pixels", points.len())));
+        }
+        let wide: Vec<[f32; 4]> = points.iter().map(|[x, y, z]| [*x, *y, *z, 0.0]).collect();
+        let bytes = bytemuck::cast_slice(&wide);
+        self.gpu.guarded(|| self.gpu.queue().write_buffer(&self.picture, 0, bytes))
+    }
+
+    /// The picture on the device, row by row, as four floats for each pixel: to be read by a host's shaders.
+    pub fn picture(&self) -> &wgpu::Buffer {
+        &self.picture
+    }
+
+    /// Says how long the last picture took, on a device without timestamps: what a budget goes by.
+    pub fn took(&mut self, milliseconds: f32) {
+        if let Some(stages) = self.stages.as_mut() {
+            stages.told(milliseconds);
+        }
+    }
+
+    /// The milliseconds that the last picture took of those with a budget whose time is known.
+    pub fn took_ms(&self) -> Option<f32> {
+        self.stages.as_ref().and_then(Stages::took_ms)
     }
 
     /// As [`Renderer::prepare`], for a shader of tests, which goes on from what the picture holds.
@@ -216,7 +304,7 @@ impl Renderer {
         source: Source,
     ) -> Result<(), GpuError> {
         self.prepare_shader(volume, look, pass, 0, None, source, false)?;
-        self.prepared = self.prepared.map(|(key, _)| (key, false));
+        self.prepared = self.prepared.take().map(|prepared| Prepared { is_first: false, ..prepared });
         Ok(())
     }
 
@@ -235,6 +323,11 @@ impl Renderer {
     pub fn set_frame(&mut self, volume: &Volume, frame: usize) -> Result<(), GpuError> {
         check_frame(volume, frame)?;
         self.current.size[2] = frame as u32;
+        let look = self.prepared.as_ref().and_then(|prepared| prepared.look.as_ref());
+        if let (Some(look), Some(stages)) = (look, self.stages.as_ref()) {
+            // A light volume lies elsewhere around another frame.
+            stages.settle(&mut self.current, volume, look, frame);
+        }
         self.write_params()
     }
 
@@ -277,11 +370,15 @@ impl Renderer {
                 source: wgpu::ShaderSource::Wgsl(text.into()),
             });
             let [(pass_layout, _), _] = &self.groups;
+            let has_volume = !matches!(source, Source::Upsample | Source::Accumulate);
+            let has_depth = features.has_depth && source != Source::LightVolume;
+            let own = self.stages.as_ref().filter(|_| features.is_real_time);
+            let sky = features.sky_map[0].then_some(&self.sky_layout);
             let layouts = [
-                Some(volume.layout()),
+                has_volume.then_some(volume.layout()),
                 Some(pass_layout),
-                features.has_depth.then_some(&self.depth_layout),
-                features.sky_map[0].then_some(&self.sky_layout),
+                has_depth.then_some(&self.depth_layout),
+                own.and_then(|stages| stages.layout(source)).or(sky),
             ];
             let layout = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
                 label: Some(source.entry_point()),
@@ -301,7 +398,7 @@ impl Renderer {
 
     /// The WGSL of what was prepared, for programs that say what a device would make of it.
     pub fn shader(&self) -> Option<String> {
-        self.prepared.map(|((source, features), _)| source.text(&features))
+        self.prepared.as_ref().map(|Prepared { key: (source, features), .. }| source.text(features))
     }
 
     /// Records what was prepared into an encoder: the picture is there once that is submitted and done.
@@ -310,25 +407,66 @@ impl Renderer {
     /// If nothing was prepared.
     pub fn record(&mut self, encoder: &mut wgpu::CommandEncoder, volume: &Volume) -> Result<(), GpuError> {
         let nothing = || GpuError::Misuse("nothing was prepared to be recorded".to_owned());
-        let (key, is_first) = self.prepared.ok_or_else(nothing)?;
-        let pipeline = self.pipelines.get(&key).ok_or_else(nothing)?;
+        let Prepared { key: (source, features), is_first, .. } =
+            *self.prepared.as_ref().ok_or_else(nothing)?;
         if is_first {
             encoder.clear_buffer(&self.picture, 0, None);
         }
-        let descriptor = wgpu::ComputePassDescriptor { label: Some("nuage"), timestamp_writes: None };
-        let mut pass = encoder.begin_compute_pass(&descriptor);
-        pass.set_pipeline(pipeline);
-        pass.set_bind_group(0, volume.bind_group(), &[]);
-        let [(_, group), _] = &self.groups;
-        pass.set_bind_group(1, group, &[]);
-        if let Some(depth) = self.depth.as_ref().filter(|_| key.1.has_depth) {
-            pass.set_bind_group(2, depth, &[]);
+        let real_time = self.stages.as_mut().filter(|_| features.is_real_time);
+        let sources = match real_time {
+            Some(stages) => {
+                let sources = stages.advance(&mut self.current, volume, &features);
+                self.write_params()?;
+                sources
+            }
+            None => vec![source],
+        };
+        let [(_, to_picture), _] = &self.groups;
+        let stages = self.stages.as_ref().filter(|_| features.is_real_time);
+        let timer = stages.and_then(Stages::timer);
+        for (i, source) in sources.iter().enumerate() {
+            let pipeline = self.pipelines.get(&(*source, features.of(*source))).ok_or_else(nothing)?;
+            let timestamp_writes = timer.map(|timer| timer.writes(i == 0, i + 1 == sources.len()));
+            let descriptor = wgpu::ComputePassDescriptor {
+                label: Some(source.entry_point()),
+                timestamp_writes: timestamp_writes.filter(|_| i == 0 || i + 1 == sources.len()),
+            };
+            if let Some(stages) = stages.filter(|_| *source == Source::Accumulate) {
+                stages.keep(encoder, &self.picture);
+            }
+            let mut pass = encoder.begin_compute_pass(&descriptor);
+            pass.set_pipeline(pipeline);
+            if !matches!(source, Source::Upsample | Source::Accumulate) {
+                pass.set_bind_group(0, volume.bind_group(), &[]);
+            }
+            // What is not yet the picture goes to the next stage.
+            let target = match (stages, source) {
+                (Some(stages), Source::March) if sources.last() != Some(source) => &stages.marched,
+                (Some(stages), Source::Upsample) if sources.last() != Some(source) => &stages.upsampled,
+                _ => to_picture,
+            };
+            pass.set_bind_group(1, target, &[]);
+            let depth = self.depth.as_ref().filter(|_| features.has_depth && *source != Source::LightVolume);
+            if let Some(depth) = depth {
+                pass.set_bind_group(2, depth, &[]);
+            }
+            if let Some(stages) = stages {
+                pass.set_bind_group(3, stages.group(*source), &[]);
+            }
+            if let Some((_, sky)) = self.sky.as_ref().filter(|_| features.sky_map[0]) {
+                pass.set_bind_group(3, sky, &[]);
+            }
+            let size = match source {
+                Source::LightVolume => [light_volume::NODES; 2],
+                Source::March if features.is_real_time => [self.current.marched[0], self.current.marched[1]],
+                _ => self.size,
+            };
+            let [x, y] = size.map(|side| side.div_ceil(WORKGROUP_SIDE));
+            pass.dispatch_workgroups(x, y, 1);
         }
-        if let Some((_, sky)) = self.sky.as_ref().filter(|_| key.1.sky_map[0]) {
-            pass.set_bind_group(3, sky, &[]);
+        if let Some(stages) = self.stages.as_mut().filter(|_| features.is_real_time) {
+            stages.send_times_back(encoder);
         }
-        let [x, y] = self.size.map(|side| side.div_ceil(WORKGROUP_SIDE));
-        pass.dispatch_workgroups(x, y, 1);
         Ok(())
     }
 
@@ -428,8 +566,13 @@ impl Renderer {
         let mut encoder =
             self.gpu.device().create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
         self.record(&mut encoder, volume)?;
+        let start = Instant::now();
         self.gpu.guarded(|| self.gpu.queue().submit([encoder.finish()]))?;
-        self.gpu.wait()
+        self.gpu.wait()?;
+        if self.prepared.as_ref().is_some_and(|prepared| prepared.key.1.is_real_time) {
+            self.took(start.elapsed().as_secs_f32() * 1e3);
+        }
+        Ok(())
     }
 
     /// The picture, row by row: colour times opacity, and opacity; of paths their mean.
@@ -454,15 +597,15 @@ fn features(
     view: u32,
 ) -> Features {
     let (chunks, log2_chunk_words) = volume.chunks();
-    let is_lit = matches!(source, Source::March | Source::Path);
+    let is_lit = matches!(source, Source::March | Source::Path | Source::Shadow);
     let (lookup, sky_rays, shadow_step_voxels) = match *pass {
-        Pass::March(Quality { lookup, shadow_step_voxels, .. }) => (lookup, false, shadow_step_voxels),
+        Pass::March(quality) | Pass::RealTime { quality, .. } | Pass::Shadow(quality) => {
+            (quality.lookup, false, quality.shadow_step_voxels)
+        }
         Pass::Path { settings: PathSettings { lookup, sky_rays, .. }, .. } => (lookup, sky_rays, 1.0),
         _ => (Lookup::Trilinear, false, 1.0),
     };
     let is_solid = |medium: &Medium| !matches!(medium.place, MediumPlace::Channel(_));
-    let density = look.density_channel() as u32;
-    let coarse = look.media.first().and_then(|medium| medium.coarse);
     let has_sky_map = matches!(&look.sky, Sky::Map(map) if !map.is_black());
     Features {
         codecs: volume.codecs(),
@@ -472,7 +615,7 @@ fn features(
         // Where nothing is, there is one medium of nothing.
         media: look.media.len().max(1) as u32,
         has_solids: look.media.iter().any(is_solid),
-        density_channels: [density, coarse.map_or(density, |channel| channel as u32)],
+        density_channels: [look.density_channel() as u32, look.shadow_channel() as u32],
         glow_channel: look.media.iter().find_map(Medium::glow_channel).filter(|_| is_lit),
         is_grey: look.is_grey() || !is_lit,
         lookup,
@@ -482,6 +625,8 @@ fn features(
         has_maps: volume.has_maps(),
         are_densities: volume.are_densities(),
         view: if is_lit { 0 } else { view },
+        is_real_time: matches!(pass, Pass::RealTime { .. }),
+        has_light_volume: false,
         encodes_srgb: false,
         counts: false,
     }
@@ -503,7 +648,8 @@ fn source_of(pass: &Pass) -> Source {
     match pass {
         Pass::View(View::Surface { .. }) | Pass::SurfaceHits { .. } => Source::Surface,
         Pass::View(_) | Pass::Hits { .. } | Pass::Opacity { .. } => Source::Views,
-        Pass::March(_) => Source::March,
+        Pass::March(_) | Pass::RealTime { .. } => Source::March,
+        Pass::Shadow(_) => Source::Shadow,
         Pass::Path { .. } => Source::Path,
     }
 }
@@ -518,6 +664,56 @@ fn check_frame(volume: &Volume, frame: usize) -> Result<(), GpuError> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::arrays::Arrays;
+    use crate::real_time::RealTime;
+    use glam::Vec3;
+    use nuage_render::light::Light;
+    use nuage_render::march::Quality;
+
+    /// Filled when the light, the medium's extinction, the frame or what the volume holds is another, and else not: whoever
+    /// looks, however finely, and whatever colour it has.
+    #[test]
+    fn light_volumes_are_filled_when_light_changes() {
+        let Some(gpu) = crate::twins::gpu() else { return };
+        let channel = crate::hostile::block(2);
+        let arrays = Arrays::of_channels(&[&channel]).expect("arrays");
+        let mut volume = Volume::new(&gpu, &arrays).expect("a volume");
+        let mut look = crate::hostile::look();
+        let mut renderer = Renderer::new(&gpu, [16, 9]).expect("a renderer");
+        let quality = Quality::default();
+        let mut fills = |volume: &Volume, look: &Look, quality: Quality, frame: usize, has_depth: bool| {
+            let pass = Pass::RealTime { quality, measures: RealTime::default() };
+            let mut params = look.params(volume, &pass, [16, 9], frame).expect("parameters");
+            let stages = renderer.stages().expect("stages");
+            stages.ask(&gpu, quality, RealTime::default()).expect("a quality");
+            assert!(stages.settle(&mut params, volume, look, frame), "no light volume");
+            let features = features(volume, look, &pass, Source::March, has_depth, 0);
+            let features = Features { has_light_volume: true, ..features };
+            stages.advance(&mut params, volume, &features).contains(&Source::LightVolume)
+        };
+        assert!(fills(&volume, &look, quality, 0, false), "the first");
+        assert!(!fills(&volume, &look, quality, 0, false), "the same");
+        look.camera.origin.x += 1.0;
+        look.media[0].albedo = [0.5; 3];
+        look.sky = Sky::Constant([0.0; 3]);
+        let finer = Quality { step_voxels: 0.5, sky_rays: 3, ..quality };
+        assert!(!fills(&volume, &look, finer, 0, true), "another view, colour, sky and step");
+        if let Some(Light::Sun(sun)) = look.lights.first_mut() {
+            sun.irradiance = [7.0; 3];
+        }
+        assert!(!fills(&volume, &look, quality, 0, false), "a brighter sun");
+        if let Some(Light::Sun(sun)) = look.lights.first_mut() {
+            sun.direction_to = Vec3::X;
+        }
+        assert!(fills(&volume, &look, quality, 0, false), "another sun");
+        look.media[0].extinction = [4.0; 3];
+        assert!(fills(&volume, &look, quality, 0, false), "another extinction");
+        assert!(!fills(&volume, &look, quality, 0, false), "the same again");
+        volume.fill(&gpu, &arrays).expect("as much room");
+        assert!(fills(&volume, &look, quality, 0, false), "a volume that was filled anew");
+        let other = Volume::new(&gpu, &arrays).expect("a volume");
+        assert!(fills(&other, &look, quality, 0, false), "another volume");
+    }
 
     #[test]
     fn what_changes_is_found() {

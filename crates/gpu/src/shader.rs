@@ -22,6 +22,7 @@ use crate::build;
 use crate::maps::{self, ABSENT_TAG};
 use crate::params::{self, Field, MAX_LIGHTS, MAX_MEDIA};
 use crate::upload::FIRST_TEXTURE;
+use crate::{blue_noise, light_volume, real_time};
 
 /// Pixels along each side of a workgroup.
 pub(crate) const WORKGROUP_SIDE: u32 = 8;
@@ -67,6 +68,10 @@ pub(crate) struct Features {
     pub(crate) are_densities: bool,
     /// What a view shows. Others have none.
     pub(crate) view: u32,
+    /// Whether pictures follow each other, with what `real_time.wgsl` does for them.
+    pub(crate) is_real_time: bool,
+    /// Whether the sun's light is read from the light volume.
+    pub(crate) has_light_volume: bool,
     /// Whether a target takes encoded colours.
     pub(crate) encodes_srgb: bool,
     /// Whether look-ups are counted in place of light.
@@ -92,6 +97,8 @@ impl Features {
         has_maps: false,
         are_densities: true,
         view: 0,
+        is_real_time: false,
+        has_light_volume: false,
         encodes_srgb: false,
         counts: false,
     };
@@ -115,9 +122,21 @@ impl Features {
         has_maps: true,
         are_densities: false,
         view: 0,
+        is_real_time: false,
+        has_light_volume: false,
         encodes_srgb: true,
         counts: false,
     };
+
+    /// What matters to a shader: all, but to those that read nothing of the volume.
+    pub(crate) fn of(self, source: Source) -> Features {
+        match source {
+            Source::Upsample | Source::Accumulate => {
+                Features { has_depth: self.has_depth, is_real_time: self.is_real_time, ..Features::BARE }
+            }
+            _ => self,
+        }
+    }
 
     /// Whether there is one grid and nothing else.
     fn is_one_grid(&self) -> bool {
@@ -176,6 +195,14 @@ pub(crate) enum Source {
     March,
     /// The path tracer.
     Path,
+    /// The light volume.
+    LightVolume,
+    /// From pictures of a quarter of the pixels to all of them.
+    Upsample,
+    /// The mean of pictures that follow each other.
+    Accumulate,
+    /// The volume's shadow on a scene.
+    Shadow,
     /// From sums of light to a target.
     Tone,
     /// Small functions over many inputs, for tests.
@@ -212,6 +239,10 @@ impl Source {
             Source::Surface => "surface",
             Source::March => "march",
             Source::Path => "path",
+            Source::LightVolume => "light_volume",
+            Source::Upsample => "upsample",
+            Source::Accumulate => "accumulate",
+            Source::Shadow => "shadow",
             Source::Tone => "tone",
             #[cfg(test)]
             Source::Twins => "twins",
@@ -235,6 +266,7 @@ impl Source {
         text += if features.counts { file!("count") } else { file!("no_count") };
         COMMON.iter().for_each(|part| text += part);
         let end = if features.has_depth { file!("depth_end") } else { file!("open_end") };
+        let kind = if features.is_real_time { file!("real_time") } else { file!("still") };
         let first_voxel = hdda(
             features,
             &Body {
@@ -308,11 +340,26 @@ impl Source {
                 file!("camera"),
                 file!("emission"),
                 end,
+                kind,
                 file!("cells"),
                 file!("depth"),
                 &voxel_depth,
                 file!("march"),
             ],
+            Source::Shadow => &[
+                file!("camera"),
+                file!("emission"),
+                end,
+                file!("still"),
+                file!("cells"),
+                file!("depth"),
+                &voxel_depth,
+                file!("march"),
+                file!("shadow"),
+            ],
+            Source::LightVolume => &[file!("camera"), file!("light_volume")],
+            Source::Upsample => &[file!("camera"), end, file!("upsample")],
+            Source::Accumulate => &[file!("camera"), end, file!("accumulate")],
             Source::Path => &[
                 file!("camera"),
                 file!("emission"),
@@ -646,6 +693,7 @@ fn prelude(features: &Features) -> String {
     p.f("GAUSS_NUDGE", 1e-5);
     p.f("LIT_PIECE_DEPTH", march::LIT_PIECE_DEPTH);
     p.f("LIT_PIECE_VOXELS", march::LIT_PIECE_VOXELS);
+    p.f("MOST_PIECES", march::MOST_PIECES);
     p.f("GROUP_VOXELS", march::GROUP_VOXELS);
     p.f("FAINT_GROUP", march::FAINT_GROUP);
     p.f("FAINT_GROUP_VOXELS", march::FAINT_GROUP_VOXELS);
@@ -678,6 +726,13 @@ fn prelude(features: &Features) -> String {
     p.u("GLOW_CHANNEL", features.glow_channel.unwrap_or(0));
     p.b("HAS_EMISSION", features.glow_channel.is_some());
     p.b("IS_GREY", features.is_grey);
+    p.b("HAS_DEPTH", features.has_depth);
+    p.b("HAS_LIGHT_VOLUME", features.has_light_volume);
+    p.u("LIGHT_NODES", light_volume::NODES);
+    p.u("NOISE_SIDE", blue_noise::SIDE);
+    p.f("LEAST_WEIGHT", real_time::LEAST_WEIGHT);
+    p.f("UPSAMPLE_TOLERANCE", real_time::UPSAMPLE_TOLERANCE);
+    p.f("KEPT_TOLERANCE", real_time::KEPT_TOLERANCE);
     p.b("ENCODES_SRGB", features.encodes_srgb);
     for (i, name) in [
         "VIEW_DENSITY",
@@ -711,13 +766,25 @@ mod tests {
 
     #[test]
     fn every_entry_point_is_valid() {
-        let sources =
-            [Source::Views, Source::Surface, Source::March, Source::Path, Source::Tone, Source::Twins];
+        let sources = [
+            Source::Views,
+            Source::Surface,
+            Source::March,
+            Source::Path,
+            Source::LightVolume,
+            Source::Upsample,
+            Source::Accumulate,
+            Source::Shadow,
+            Source::Tone,
+            Source::Twins,
+        ];
         let tricubic = Features { lookup: Lookup::Tricubic, glow_channel: Some(0), ..Features::BARE };
         validate(&probe());
         let textures = Features { textures: 7, ..Features::ALL };
         let depth = Features { has_depth: true, chunks: 4, textures: 4, counts: true, ..Features::ALL };
-        for features in [Features::ALL, Features::BARE, tricubic, textures, depth] {
+        let real_time = Features { is_real_time: true, has_light_volume: true, ..tricubic };
+        let cut = Features { has_depth: true, has_exact_shadows: true, ..real_time };
+        for features in [Features::ALL, Features::BARE, tricubic, textures, depth, real_time, cut] {
             for source in sources {
                 let text = source.text(&features);
                 validate(&text);

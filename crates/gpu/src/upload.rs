@@ -29,6 +29,8 @@ pub struct Volume {
     /// With their place among the formats.
     textures: Vec<(usize, Blocks)>,
     arrays: Summary,
+    /// How often words were copied over what was there.
+    fills: u64,
     log2_chunk_words: u32,
     size_bytes: SizeBytes,
 }
@@ -47,6 +49,9 @@ struct Summary {
     /// Of each channel, frame by frame.
     places: Vec<Option<Place>>,
 }
+
+/// Which volume it is, and how often it was filled.
+pub(crate) type Content = (wgpu::BindGroup, u64);
 
 /// The memory that a volume takes on its device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -154,6 +159,7 @@ impl Volume {
             bricks,
             textures,
             arrays,
+            fills: 0,
             log2_chunk_words,
             size_bytes,
         })
@@ -164,6 +170,7 @@ impl Volume {
     /// # Errors
     /// If the device fails.
     pub(crate) fn fill(&mut self, gpu: &Gpu, arrays: &Arrays) -> Result<u64, GpuError> {
+        self.fills += 1;
         let mut sent = 0;
         let mut write = |buffer: &wgpu::Buffer, at: u64, bytes: &[u8]| {
             sent += bytes.len() as u64;
@@ -224,6 +231,11 @@ impl Volume {
 
     pub(crate) fn bind_group(&self) -> &wgpu::BindGroup {
         &self.bind_group
+    }
+
+    /// What is another once anything is there that was not.
+    pub(crate) fn content(&self) -> Content {
+        (self.bind_group.clone(), self.fills)
     }
 
     /// Where the world of shaders begins.

@@ -6,7 +6,7 @@
 mod common;
 
 use common::{SIZE, gpu, hold, lit, packed, picture, unpacked, uploaded};
-use glam::{DAffine3, DMat3, DMat4, DVec2, DVec3, DVec4, IVec3};
+use glam::{DAffine3, DMat3, DMat4, DVec2, DVec3, DVec4, IVec3, Vec3};
 use nuage_gpu::arrays::{Arrays, Bricks, Meaning, Wanted};
 use nuage_gpu::device::{self, Gpu};
 use nuage_gpu::error::GpuError;
@@ -14,6 +14,7 @@ use nuage_gpu::look::{Look, Pass};
 use nuage_gpu::renderer::{Depth, Renderer};
 use nuage_gpu::upload::Volume as GpuVolume;
 use nuage_pipeline::pack::options::Options;
+use nuage_render::light::{Light, Sun};
 use nuage_render::march::Quality;
 use nuage_vdb::AnyTree;
 use nuage_volume::build::TileSize;
@@ -134,15 +135,15 @@ fn volumes_end_at_the_depth_buffer() {
         ("reversed without end", projection(0.0, near)),
     ];
     let mut renderer = common::renderer(&gpu);
-    let mut show = |clip_from_view: DMat4, value: f32| {
+    let mut show = |look: &Look, pass: &Pass, clip_from_view: DMat4, value: f32| {
         let depth = Depth { view: &depth_of(&gpu, value), clip_from_world: clip_from_view * view };
-        renderer.prepare(&volume, &look, &Pass::March(quality), 0, Some(&depth)).expect("a pass");
+        renderer.prepare(&volume, look, pass, 0, Some(&depth)).expect("a pass");
         renderer.run(&volume).expect("a run");
         renderer.pixels().expect("pixels")
     };
     for (name, clip_from_view) in projections {
         let value = clip_from_view.project_point3(DVec3::new(0.0, 0.0, -wall)).z as f32;
-        let pixels = show(clip_from_view, value);
+        let pixels = show(&look, &Pass::March(quality), clip_from_view, value);
         let mut worst = 0.0_f64;
         let mut cut = 0;
         for (i, pixel) in (0..).zip(&pixels) {
@@ -166,8 +167,41 @@ fn volumes_end_at_the_depth_buffer() {
         println!("{name}: {cut} pixels are cut, the worst is off by {worst:.2e}");
         assert!(cut > 2000 && worst < 1e-3, "{name}: {cut}, {worst}");
     }
+    // The shadow on the wall of a sun behind the camera has a closed form too.
+    let sun = Sun::point(Vec3::new(0.3, 0.2, 1.0).normalize(), [1.0; 3]);
+    let in_light = Look { lights: vec![Light::Sun(sun)], ..look.clone() };
+    let quality = Quality { shadow_step_voxels: 0.5, shadow_growth: 0.0, ..quality };
+    for (name, clip_from_view) in projections {
+        let value = clip_from_view.project_point3(DVec3::new(0.0, 0.0, -wall)).z as f32;
+        let pixels = show(&in_light, &Pass::Shadow(quality), clip_from_view, value);
+        let (mut worst, mut shaded) = (0.0_f64, 0);
+        for (i, pixel) in (0..).zip(&pixels) {
+            let at = DVec2::new(f64::from(i % SIZE[0]), f64::from(i / SIZE[0])) + 0.5;
+            let ray = scene.camera.ray(at, SIZE[0], SIZE[1]);
+            let place = ray.origin + ray.direction * (wall / ray.direction.dot(scene.camera.forward));
+            let to_sun = sun.direction_to.as_dvec3();
+            let leaves = ((last.as_dvec3() * voxel - place) / to_sun).min_element();
+            // Where the ray leaves the block by its front, and begins well inside.
+            let out = place + to_sun * leaves;
+            let is_inside = place.min_element() > 0.1 && out.truncate().max_element() < 1.9;
+            if !is_inside || place.truncate().max_element() > 1.9 {
+                continue;
+            }
+            let expected = (-0.8 * (leaves + 0.5 * voxel / to_sun.z)).exp();
+            worst = worst.max((f64::from(pixel[0]) - expected).abs());
+            shaded += 1;
+        }
+        println!("{name}: {shaded} pixels are shaded, the worst is off by {worst:.2e}");
+        assert!(shaded > 1000 && worst < 1e-3, "{name}: {shaded}, {worst}");
+        // What is nowhere has no shadow; a far plane is somewhere.
+        if name.ends_with("without end") {
+            let value = if name.starts_with("reversed") { 0.0 } else { 1.0 };
+            let nothing = show(&in_light, &Pass::Shadow(quality), clip_from_view, value);
+            assert!(nothing.iter().all(|pixel| pixel[0] == 1.0), "{name}: a shadow on nothing");
+        }
+    }
     // With nothing in front all of it is there.
-    let whole = show(ordinary, 1.0);
+    let whole = show(&look, &Pass::March(quality), ordinary, 1.0);
     let alone = picture(&mut common::renderer(&gpu), &volume, &look, &Pass::March(quality), 0);
     hold("nothing in front", &whole, &alone);
 }

@@ -38,6 +38,8 @@ use crate::traverse::{Field, LocalRay, Reader, Run, RunKind, Runs, floor};
 pub const LIT_PIECE_DEPTH: f32 = 0.25;
 /// … or after this many voxels, whichever is shorter.
 pub const LIT_PIECE_VOXELS: f32 = 8.0;
+/// The most pieces of one run.
+pub const MOST_PIECES: f32 = 65536.0;
 /// A group of steps that share a ray to the sun is no longer than this, …
 pub const GROUP_VOXELS: f32 = 8.0;
 /// … unless it scatters less than this part of a full group; then …
@@ -312,7 +314,7 @@ impl<'s> Marcher<'s> {
                 let length = piece.t1 - piece.t0;
                 let depth = constant(density_kind) * scale * length;
                 let pieces = (depth / LIT_PIECE_DEPTH).max(length * voxels_per_length / LIT_PIECE_VOXELS);
-                let pieces = if lit && depth > 0.0 { pieces.ceil().clamp(1.0, 65536.0) } else { 1.0 };
+                let pieces = if lit && depth > 0.0 { pieces.ceil().clamp(1.0, MOST_PIECES) } else { 1.0 };
                 let at = |i: f32| if i < pieces { piece.t0 + length * (i / pieces) } else { piece.t1 };
                 (0..pieces as u32).all(|i| step(at(i as f32), at(i as f32 + 1.0)))
             };

@@ -64,7 +64,7 @@ struct Params {
     sky_ground: vec4<f32>,
     // Step of camera rays and of shadow rays in voxels, growth, least transmittance.
     march: vec4<f32>,
-    // Rays to the sun and to the sky, the depth at which shadow rays end.
+    // Rays to the sun and to the sky, the depth at which shadow rays end, the step of the light volume in voxels.
     march_rays: vec4<f32>,
     sun_direction: vec4<f32>,
     sun_irradiance: vec4<f32>,
@@ -77,6 +77,26 @@ struct Params {
     clip_y: vec4<f32>,
     clip_z: vec4<f32>,
     clip_w: vec4<f32>,
+    // Width and height of what is marched, pixels of the picture along each side of one of its pixels, and the number of the
+    // picture.
+    marched: vec4<u32>,
+    // In positions of the field that shadow rays meet: the node of the light volume nearest to the sun, and the way to the next node along
+    // each of its axes; last, the world length of that away from the sun.
+    light_first: vec4<f32>,
+    light_x: vec4<f32>,
+    light_y: vec4<f32>,
+    light_z: vec4<f32>,
+    // Rows of what takes positions of that field to coordinates of the light volume.
+    light_u: vec4<f32>,
+    light_v: vec4<f32>,
+    light_w: vec4<f32>,
+    // The camera of the picture before.
+    before_camera: vec4<f32>,
+    before_forward: vec4<f32>,
+    before_right: vec4<f32>,
+    before_up: vec4<f32>,
+    // The most pictures that a mean counts as, whether colours before are clamped, whether the camera moved.
+    history: vec4<f32>,
     // Rows of what takes the world to the map of the sky, and its width and height.
     map_x: vec4<f32>,
     map_y: vec4<f32>,

@@ -23,6 +23,17 @@ fn field_of(channel: u32) -> u32 {
     return params.size.z * tree[FIELDS_PER_FRAME] + channel;
 }
 
+// The pixel of the picture that a pixel of those that are marched stands for.
+fn pixel_of_marched(marched: vec2<u32>) -> vec2<u32> {
+    return min(marched * params.marched.z + marched_offset(), params.size.xy - 1u);
+}
+
+// Which of the pixels that it stands for a marched pixel shows: in turn all of them.
+fn marched_offset() -> vec2<u32> {
+    let number = params.marched.w;
+    return vec2<u32>((number ^ (number >> 1u)) & 1u, number & 1u) & vec2<u32>(params.marched.z - 1u);
+}
+
 fn store(pixel: vec2<u32>, value: vec4<f32>) {
     picture[pixel.y * params.size.x + pixel.x] = shown(value);
 }

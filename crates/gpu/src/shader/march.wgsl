@@ -115,17 +115,22 @@ fn optical_depth(field: u32, ray: LocalRay, end: f32, lattice: Lattice, scale: f
     return depth;
 }
 
+// The share of the light from the direction of a ray that gets to where it begins, without steps.
+fn exact_transmittance(field: u32, ray: LocalRay) -> f32 {
+    var depth: f32;
+    if (MEAN_LOOKUP == LOOKUP_NEAREST) {
+        depth = voxel_integral(field, ray);
+    } else {
+        depth = line_integral(field, ray, field_exit(field, ray));
+    }
+    return exp_(-params.media[0].extinction.x * depth);
+}
+
 // The share of the light from a direction that gets to a place on the camera ray.
 fn march_transmittance(lighting: ptr<function, Lighting>, t: f32, direction: vec3<f32>) -> f32 {
     let ray = local_ray(ray_at((*lighting).ray, t), direction);
     if (HAS_EXACT_SHADOWS) {
-        var exact: f32;
-        if (MEAN_LOOKUP == LOOKUP_NEAREST) {
-            exact = voxel_integral((*lighting).field, ray);
-        } else {
-            exact = line_integral((*lighting).field, ray, field_exit((*lighting).field, ray));
-        }
-        return exp_(-params.media[0].extinction.x * exact);
+        return exact_transmittance((*lighting).field, ray);
     }
     let voxel = u32(i32(floor((*lighting).voxels_to_start + t * (*lighting).voxels_per_length)));
     let shift = unit_f32(hash_u32((*lighting).random ^ hash_u32(voxel ^ ((*lighting).sky_index << 24u))));
@@ -189,6 +194,10 @@ fn step_light(lighting: ptr<function, Lighting>, t0: f32, t1: f32, share: f32, i
             }
             radiance = (*lighting).sun * group.share;
             t = group.moment / group.share;
+            if (HAS_LIGHT_VOLUME) {
+                light += radiance * cached_transmittance(ray_at((*lighting).ray, t));
+                continue;
+            }
         } else {
             if (!(*lighting).has_sky || (*lighting).scattered <= (*lighting).next_sky) {
                 break;
@@ -204,8 +213,13 @@ fn step_light(lighting: ptr<function, Lighting>, t0: f32, t1: f32, share: f32, i
     return light;
 }
 
-// The light from the medium along a ray, and the share of the light behind it that passes.
-fn march_radiance(ray: Ray, max_distance: f32, random: u32) -> vec4<f32> {
+// How far away the steps of the last ray were, each times the share of the camera's light that it took.
+var<private> depth_moment: f32;
+
+// The light from the medium along a ray, and the share of the light behind it that passes. Steps begin at a part `shift` of
+// one.
+fn march_radiance(ray: Ray, max_distance: f32, random: u32, shift: f32) -> vec4<f32> {
+    depth_moment = 0.0;
     var scattered = vec3<f32>(0.0);
     var transmittance = 1.0;
     let density = field_of(DENSITY_CHANNEL);
@@ -231,7 +245,7 @@ fn march_radiance(ray: Ray, max_distance: f32, random: u32) -> vec4<f32> {
         select(0.0, length(local.direction), has_density), select(0.0, length(glow_local.direction), has_glow),
     );
     let step_length = params.march.x / voxels_per_length;
-    let lattice = Lattice(step_length, fract(unit_f32(hash_u32(random)) - start / step_length), 0.0);
+    let lattice = Lattice(step_length, fract(shift - start / step_length), 0.0);
     var lighting = new_lighting(ray, start, local, random);
     lighting.has_sun = lighting.has_sun && has_density;
     lighting.has_sky = lighting.has_sky && has_density;
@@ -278,7 +292,7 @@ fn march_radiance(ray: Ray, max_distance: f32, random: u32) -> vec4<f32> {
         let piece_depth = constant_density * scale * (t1 - t0);
         if (!is_varying && is_lit && piece_depth > 0.0) {
             let wanted = max(piece_depth / LIT_PIECE_DEPTH, (t1 - t0) * voxels_per_length / LIT_PIECE_VOXELS);
-            pieces = clamp(ceil(wanted), 1.0, 65536.0);
+            pieces = clamp(ceil(wanted), 1.0, MOST_PIECES);
         }
         var piece = 0.0;
         loop {
@@ -320,6 +334,7 @@ fn march_radiance(ray: Ray, max_distance: f32, random: u32) -> vec4<f32> {
             }
             let absorbed = one_minus_exp_neg(depth);
             let share = transmittance * absorbed;
+            depth_moment += share * (start + t);
             if (is_lit) {
                 scattered += step_light(&lighting, step.x, step.y, share, is_last);
             }
@@ -352,15 +367,20 @@ fn pixel_offset(pixel: vec2<u32>, sample_index: u32, samples: u32) -> vec2<f32> 
 
 @compute @workgroup_size(WORKGROUP_SIDE, WORKGROUP_SIDE)
 fn march(@builtin(global_invocation_id) id: vec3<u32>) {
-    if (any(id.xy >= params.size.xy)) {
+    if (any(id.xy >= params.marched.xy)) {
         return;
     }
+    let pixel = pixel_of_marched(id.xy);
     let samples = max(params.counts.x, 1u);
     var sum = vec4<f32>(0.0);
+    var depth = 0.0;
     for (var i = 0u; i < samples; i++) {
-        let ray = camera_ray(vec2<f32>(id.xy) + pixel_offset(id.xy, i, samples));
-        let light = march_radiance(ray, end_of(id.xy, ray), hash_pixel(id.x, id.y, i, 2u));
+        let ray = camera_ray(vec2<f32>(pixel) + pixel_offset(pixel, i, samples));
+        let random = hash_pixel(pixel.x, pixel.y, i + samples * params.marched.w, 2u);
+        let light = march_radiance(ray, end_of(pixel, ray), random, step_shift(id.xy, random));
         sum += vec4<f32>(light.xyz, 1.0 - light.w);
+        depth += depth_moment;
     }
-    store(id.xy, sum / f32(samples));
+    keep_depth(id.xy, depth / max(sum.w, MIN_F32));
+    picture[id.y * params.marched.x + id.x] = sum / f32(samples);
 }
