@@ -84,6 +84,13 @@ done
 for form in f32 u8; do
   compare "$form" surface SURFACE "${files[1]}"
 done
+march_size=$((size / 4))
+for form in f32 u8; do
+  ours=${files[0]}
+  [ "$form" = f32 ] || ours=$out/$(basename "$ours" .vdb).$form.nuage
+  line=$("$rays" "$ours" - march - "$repeats" "$march_size" "$out/nuage_MARCH_$form.wgsl")
+  echo "ray marcher, ${march_size}², $form: $(field cpu_ms "$line") ($(field wall_ms "$line"))"
+done
 for file in "${files[@]}"; do
   for codec in u4 u8; do
     echo "$(basename "$file" .vdb), $codec: $(grep -o '[0-9.]* dB' "$out/$(basename "$file" .vdb).$codec.txt" | head -n 1)"
@@ -97,6 +104,7 @@ for family in ${FAMILIES-NAVI21 GFX1100}; do
   for kernel in SURFACE NEAREST_SPANS TRILINEAR_SPANS; do
     [ ! -f "$out/nuage_${kernel}_f32.wgsl" ] || shaders+=("$out/nuage_${kernel}_f32.wgsl" "$out/$kernel.spv")
   done
+  shaders+=("$out/nuage_MARCH_f32.wgsl" "$out/nuage_MARCH_u8.wgsl")
   VK_DRIVER_FILES=$radv RADV_FORCE_FAMILY=$family MESA_SHADER_CACHE_DISABLE=true \
     "$target/debug/xtask" bench isa "${shaders[@]}" 2>/dev/null
 done

@@ -3,7 +3,8 @@
 //! `cargo run -p nuage-gpu --example rays -- FILE FILE.nvdb KERNEL SHADER.spv REPEATS [SIZE
 //! [OURS.wgsl]]` prints one line, and keeps our shader if it is told where. FILE is a .vdb
 //! file, whose bricks stand on the device as floats, or a .nuage file, whose bricks do as they are stored. KERNEL is `surface`,
-//! `nearest` or `trilinear`; the shader is `bench/peers/pnanovdb.comp` made for it, which says what they are. Reading and
+//! `nearest` or `trilinear`; the shader is `bench/peers/pnanovdb.comp` made for it, which says what they are. Or it is `march`, the
+//! ray marcher as it is by default, beneath a sun and an even sky: that has no twin there, and neither FILE.nvdb nor the shader is read. Reading and
 //! uploading are not timed, and a picture is made before the first that is. Times are of all threads' processors, and wall
 //! clock around submission and waiting.
 
@@ -13,7 +14,7 @@
 use std::error::Error;
 use std::time::Instant;
 
-use glam::{DAffine3, DVec3, IVec3};
+use glam::{DAffine3, DVec3, IVec3, Vec3};
 use nuage_gpu::arrays::{Arrays, Bricks, Meaning, Wanted};
 use nuage_gpu::device::Gpu;
 use nuage_gpu::look::{Look, Medium, MediumPlace, Pass};
@@ -22,7 +23,8 @@ use nuage_gpu::upload::Volume;
 use nuage_pipeline::import::{import, import_surface};
 use nuage_render::camera::Camera;
 use nuage_render::filter::Filter;
-use nuage_render::light::Sky;
+use nuage_render::light::{Light, Sky, Sun};
+use nuage_render::march::Quality;
 use nuage_render::scene::Phase;
 use nuage_volume::format::Asset;
 
@@ -284,16 +286,18 @@ fn main() -> Result<(), Failure> {
         place: MediumPlace::Channel(0),
         coarse: None,
         extinction: [(EXTINCTION_PER_VOXEL / voxel_size) as f32; 3],
-        albedo: [0.0; 3],
+        albedo: [0.9; 3],
         phase: Phase::HenyeyGreenstein { g: 0.0 },
         glow: None,
     };
-    let sky = Sky::Constant([0.0; 3]);
-    let look = Look { camera, media: vec![medium], lights: Vec::new(), sky };
+    let direction_to = Vec3::new(0.6, 0.64, 0.48);
+    let sun = Light::Sun(Sun { direction_to, irradiance: [3.0; 3], angle_degrees: 0.0 });
+    let look = Look { camera, media: vec![medium], lights: vec![sun], sky: Sky::Constant([1.0; 3]) };
     let pass = match kernel.as_str() {
         "surface" => Pass::Hits { above: ours.level },
         "nearest" => Pass::Opacity { filter: Filter::Nearest, step_voxels: STEP_VOXELS },
         "trilinear" => Pass::Opacity { filter: Filter::Trilinear, step_voxels: STEP_VOXELS },
+        "march" => Pass::March(Quality::default()),
         _ => return Err(format!("no kernel '{kernel}'").into()),
     };
     let mut renderer = Renderer::new(&gpu, [size; 2])?;
@@ -312,6 +316,15 @@ fn main() -> Result<(), Failure> {
         EXTINCTION_PER_VOXEL as f32,
         0.0,
     ];
+    if matches!(pass, Pass::March(_)) {
+        let mut times = Times::default();
+        for _ in 0..=repeats.max(1) {
+            times.add(|| Ok(renderer.run(&ours.volume)?))?;
+        }
+        let [wall, cpu] = times.medians();
+        println!("wall_ms={wall:.1} cpu_ms={cpu:.1}");
+        return Ok(());
+    }
     let peer = Peer::new(&gpu, &std::fs::read(peer_path)?, &std::fs::read(shader)?, size, view)?;
 
     let (mut our_times, mut peer_times) = (Times::default(), Times::default());

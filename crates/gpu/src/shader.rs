@@ -294,6 +294,23 @@ impl Source {
                 empty: "",
             },
         );
+        let samples = hdda(
+            features,
+            &Body {
+                name: "pass_samples",
+                state: "Passing",
+                layer: Layer::Brick,
+                enter: "",
+                step: "var samples = (*state).accessor;
+                let end = ceil(t1 * (*state).per_step);
+                for (var number = ceil(t0 * (*state).per_step); number < end; number += 1.0) {
+                    let position = ray_at(ray, number * (*state).step);
+                    (*state).share *= 1.0 - (*state).loss * trilinear(field, &samples, position);
+                }
+                (*state).accessor = samples;",
+                empty: "",
+            },
+        );
         let voxel_depth = hdda(
             features,
             &Body {
@@ -316,6 +333,7 @@ impl Source {
                 &first_voxel,
                 &voxel_depth,
                 &nearest_steps,
+                &samples,
             ],
             Source::Surface => &[file!("camera"), file!("cells"), file!("surface")],
             Source::March => &[
@@ -392,7 +410,6 @@ pub(crate) fn scatter_text() -> String {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Layer {
     /// A step for each brick.
-    #[cfg(test)]
     Brick,
     /// A step for each voxel of a brick.
     Voxel,
@@ -416,7 +433,6 @@ struct Body<'a> {
 /// A walk with its body put in, so that nothing is called.
 fn hdda(features: &Features, body: &Body<'_>) -> String {
     let layer = match body.layer {
-        #[cfg(test)]
         Layer::Brick => "BRICK_LAYER",
         Layer::Voxel => "VOXEL_LAYER",
     };

@@ -381,7 +381,8 @@ fn pictures_take_no_longer_than_they_may() {
             renderer.took_ms().expect("a time")
         };
         let unbounded = (0..3).map(|_| took(f32::MAX)).fold(f32::INFINITY, f32::min);
-        let budget_ms = unbounded / 3.0;
+        // A third is below what the roughest picture takes.
+        let budget_ms = unbounded / 2.0;
         let mut times: Vec<f32> = (0..17).map(|_| took(budget_ms)).skip(10).collect();
         times.sort_by(f32::total_cmp);
         println!("{unbounded:.1} ms without a bound; of {budget_ms:.1} ms pictures take {times:.1?}");

@@ -23,9 +23,11 @@ fn brick_value(field: u32, values: Values, brick: Brick, voxel: u32) -> f32 {
     count_value();
     let at = brick.at;
     var stored = bitcast<f32>(at);
-    if (HAS_F32 && brick.tag == F32_TAG) {
-        stored = bitcast<f32>(brick_word(at + voxel));
-    } else if (HAS_F16 && brick.tag == F16_TAG) {
+    if (HAS_F32) {
+        // Read in any case, which is less than a branch: beyond the bricks there is some word as well.
+        stored = select(stored, bitcast<f32>(brick_word(at + voxel)), brick.tag == F32_TAG);
+    }
+    if (HAS_F16 && brick.tag == F16_TAG) {
         stored = half_value((brick_word(at + (voxel >> 1u)) >> ((voxel & 1u) * 16u)) & 0xffffu) * values.unit;
     } else if (HAS_UNIFORM && brick.tag <= LAST_UNIFORM_TAG && brick.tag != CONSTANT_TAG) {
         let bit = voxel * brick.tag;
@@ -35,7 +37,7 @@ fn brick_value(field: u32, values: Values, brick: Brick, voxel: u32) -> f32 {
             bits |= brick_word(word + 1u) << (32u - (bit & 31u));
         }
         stored = line_at(brick.line, bits & ((1u << brick.tag) - 1u));
-    } else if (HAS_OTHER_CODECS && brick.tag != CONSTANT_TAG && brick.tag != NODE4_TILE_TAG && brick.tag != NODE5_TILE_TAG) {
+    } else if (HAS_OTHER_CODECS && brick.tag != CONSTANT_TAG && brick.tag < NODE4_TILE_TAG) {
         stored = stored_value(field, Entry(at, brick.tag), vec3<u32>(voxel >> 6u, (voxel >> 3u) & 7u, voxel & 7u));
     }
     if (ARE_DENSITIES) {

@@ -1,10 +1,11 @@
 // The cells of a brick that a ray passes: the innermost level of the walk.
 
-// A cell of a brick is one word, x above y above z in bytes, each 16 more than the coordinate: a step beyond the brick shows in
-// bits that no cell within has set or cleared.
-const CELL_ORIGIN: u32 = 0x101010u;
-const CELL_OUTSIDE: u32 = 0x181818u;
-const CELL_STEPS: vec3<u32> = vec3<u32>(0x10000u, 0x100u, 1u);
+// A cell of a brick is one word: in the lower bits the number of its voxel, a brick further on, above them each coordinate, 8 more
+// than it is, in five bits. A step is one addition, and one beyond the brick shows in bits that no cell within has set or cleared.
+const CELL_NUMBER: u32 = 0x1ffu;
+const CELL_ORIGIN: u32 = 0x200u | (0x108u << 11u) | (0x8u << 21u);
+const CELL_OUTSIDE: u32 = (0x318u << 11u) | (0x18u << 21u);
+const CELL_STEPS: vec3<u32> = vec3<u32>((1u << 21u) + 64u, (1u << 16u) + 8u, (1u << 11u) + 1u);
 
 struct Cells {
     packed: u32,
@@ -18,14 +19,14 @@ struct Cells {
 // A cell, and where the ray is in it.
 struct Cell { packed: u32, t0: f32, t1: f32 }
 
-// Counted from the brick's first.
-fn local_of(packed: u32) -> vec3<i32> {
-    return vec3<i32>((vec3<u32>(packed) >> vec3<u32>(16u, 8u, 0u)) & vec3<u32>(7u));
-}
-
 // As voxels of a brick are numbered.
 fn offset_of(packed: u32) -> u32 {
-    return ((packed >> 10u) & 0x1c0u) | ((packed >> 5u) & 0x38u) | (packed & 7u);
+    return packed & CELL_NUMBER;
+}
+
+// Counted from the brick's first.
+fn local_of(packed: u32) -> vec3<i32> {
+    return vec3<i32>((vec3<u32>(packed) >> vec3<u32>(6u, 3u, 0u)) & vec3<u32>(7u));
 }
 
 // The cells between two distances in the brick whose first voxel is at a position.
@@ -36,9 +37,9 @@ fn cells_between(ray: LocalRay, t0: f32, t1: f32, corner: vec3<f32>) -> Cells {
     let faces = corner + local + select(vec3<f32>(0.0), vec3<f32>(1.0), forward);
     let t = (faces - ray.origin) * ray.inverse;
     let is_still = ray.direction == vec3<f32>(0.0);
-    let bytes = vec3<u32>(local);
+    let steps = vec3<u32>(local) * CELL_STEPS;
     return Cells(
-        CELL_ORIGIN + ((bytes.x << 16u) | (bytes.y << 8u) | bytes.z),
+        CELL_ORIGIN + steps.x + steps.y + steps.z,
         t0, t1, select(t, vec3<f32>(MAX_F32), is_still), abs(ray.inverse),
         select(vec3<u32>(0u) - CELL_STEPS, CELL_STEPS, forward),
     );
@@ -55,7 +56,7 @@ fn next_cell(cells: ptr<function, Cells>) -> Cell {
     let step = (*cells).step;
     let stepped = packed + select(select(step.z, step.y, is_y), step.x, is_x);
     // Beyond the brick's last cell the brick ends, whatever rounding says.
-    let is_last = (stepped & CELL_OUTSIDE) != CELL_ORIGIN;
+    let is_last = (stepped & CELL_OUTSIDE) != (CELL_ORIGIN & CELL_OUTSIDE);
     let t1 = select(min(max(t0, leaves), (*cells).end), (*cells).end, is_last);
     (*cells).t = t1;
     (*cells).packed = stepped;

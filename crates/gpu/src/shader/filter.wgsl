@@ -26,6 +26,11 @@ fn voxel_value(field: u32, accessor: ptr<function, Accessor>, index: vec3<i32>) 
     return in_region(field, region_at(field, accessor, index >> vec3<u32>(LOG2_BRICK)), index);
 }
 
+// Axes as bits, in the order of the corners of a cell.
+fn axes_of(axes: vec3<bool>) -> u32 {
+    return select(0u, 4u, axes.x) | select(0u, 2u, axes.y) | select(0u, 1u, axes.z);
+}
+
 fn base_voxel(field: u32) -> vec3<i32> {
     return fields[field].base_brick.xyz << vec3<u32>(LOG2_BRICK);
 }
@@ -36,18 +41,37 @@ fn lerp8(c: array<f32, 8>, f: vec3<f32>) -> f32 {
     return mix_(low, high, f.x);
 }
 
-// The eight values of the cell whose lower corner is a voxel.
+// The eight values of the cell whose lower corner is a voxel, a bit of whose numbers each: corner 4 is the next along x. What a
+// brick's voxels share is read once for each brick that the cell reaches.
 fn corners_of(field: u32, accessor: ptr<function, Accessor>, cell: vec3<i32>) -> array<f32, 8> {
     var corners: array<f32, 8>;
-    var brick = cell >> vec3<u32>(LOG2_BRICK);
-    var region = region_at(field, accessor, brick);
-    for (var i = 0; i < 8; i++) {
-        let index = cell + vec3<i32>(i >> 2u, (i >> 1u) & 1, i & 1);
-        if (any(index >> vec3<u32>(LOG2_BRICK) != brick)) {
-            brick = index >> vec3<u32>(LOG2_BRICK);
-            region = region_at(field, accessor, brick);
+    let values = values_of(field);
+    let brick = cell >> vec3<u32>(LOG2_BRICK);
+    // The offsets in a brick of both voxels along each axis.
+    let low = vec3<u32>(cell & vec3<i32>(7)) << vec3<u32>(2u * LOG2_BRICK, LOG2_BRICK, 0u);
+    let high = vec3<u32>((cell + 1) & vec3<i32>(7)) << vec3<u32>(2u * LOG2_BRICK, LOG2_BRICK, 0u);
+    let reaching = axes_of(high < low);
+    let is_low = (cell >= fields[field].active_min.xyz) & (cell <= fields[field].active_max.xyz);
+    let is_high = (cell + 1 >= fields[field].active_min.xyz) & (cell + 1 <= fields[field].active_max.xyz);
+    // Of the axes along which the cell reaches on, all choices in turn.
+    var beyond = 0u;
+    loop {
+        let place = brick + vec3<i32>((vec3<u32>(beyond) >> vec3<u32>(2u, 1u, 0u)) & vec3<u32>(1u));
+        let entry = region_at(field, accessor, place).entry;
+        let is_there = tag_of(entry) != ABSENT_TAG;
+        let words = brick_of(values, entry);
+        for (var i = 0u; i < 8u; i++) {
+            if ((i & reaching) == beyond) {
+                let bits = vec3<bool>((i & 4u) != 0u, (i & 2u) != 0u, (i & 1u) != 0u);
+                let offset = select(low, high, bits);
+                let value = brick_value(field, values, words, offset.x | offset.y | offset.z);
+                corners[i] = select(0.0, value, is_there && all(select(is_low, is_high, bits)));
+            }
         }
-        corners[i] = select(0.0, in_region(field, region, index), is_active(field, index));
+        beyond = (beyond - reaching) & reaching;
+        if (beyond == 0u) {
+            break;
+        }
     }
     return corners;
 }

@@ -47,15 +47,15 @@ fn $NAME(field: u32, ray: LocalRay, begin: f32, end: f32, state: ptr<function, $
                 let cell = cells.packed;
                 let value = 0.0;
                 $STEP
-                cells.t = t1;
-            }
-            while (cells.t < t1) {
-                let here = next_cell(&cells);
-                let cell = here.packed;
-                let value = brick_value(field, values, words, offset_of(cell));
-                let t0 = here.t0;
-                let t1 = here.t1;
-                $STEP
+            } else {
+                while (cells.t < t1) {
+                    let here = next_cell(&cells);
+                    let cell = here.packed;
+                    let value = brick_value(field, values, words, offset_of(cell));
+                    let t0 = here.t0;
+                    let t1 = here.t1;
+                    $STEP
+                }
             }
         }
     }

@@ -20,7 +20,7 @@ fn first_voxel(field: u32, ray: Ray, above: f32) -> VoxelHit {
 }
 
 // Light that passes samples at whole multiples of a step, the first of which is at 0; and the number of the next of them.
-struct Passing { share: f32, per_step: f32, loss: f32, number: f32 }
+struct Passing { share: f32, step: f32, per_step: f32, loss: f32, number: f32, accessor: Accessor }
 
 // The power of up to seven samples in one voxel.
 fn short_power(base: f32, exponent: f32) -> f32 {
@@ -28,17 +28,6 @@ fn short_power(base: f32, exponent: f32) -> f32 {
     let square = base * base;
     return select(1.0, base, (count & 1u) != 0u) * select(1.0, square, (count & 2u) != 0u)
         * select(1.0, square * square, (count & 4u) != 0u);
-}
-
-// A power of a whole exponent.
-fn power(base: f32, exponent: u32) -> f32 {
-    var result = 1.0;
-    var factor = base;
-    for (var left = exponent; left > 0u; left >>= 1u) {
-        result *= select(1.0, factor, (left & 1u) != 0u);
-        factor *= factor;
-    }
-    return result;
 }
 
 // The share of light that passes samples: nuage_render::depth::stepped_transmittance.
@@ -55,27 +44,11 @@ fn stepped_transmittance(field: u32, ray: Ray) -> f32 {
     let step = params.march.x / length(whole.direction);
     let start = ceil(span.x / step) * step;
     let local = moved(field, ray, start);
-    var passing = Passing(1.0, 1.0 / step, params.media[0].extinction.x * step, 0.0);
+    var passing = Passing(1.0, step, 1.0 / step, params.media[0].extinction.x * step, 0.0, new_accessor());
     if (is_nearest) {
         pass_voxels(field, in_voxels(local), 0.0, span.y - start, &passing);
-        return passing.share;
-    }
-    var accessor = new_accessor();
-    var runs = runs_between(field, local, 0.0, span.y - start);
-    loop {
-        let found = next_run(&runs, &accessor);
-        if (!found.is_there) {
-            break;
-        }
-        var number = ceil(found.run.t0 * passing.per_step);
-        let end = ceil(found.run.t1 * passing.per_step);
-        if (found.run.is_varying) {
-            for (; number < end; number += 1.0) {
-                passing.share *= 1.0 - passing.loss * trilinear(field, &accessor, ray_at(local, number * step));
-            }
-        } else {
-            passing.share *= power(1.0 - passing.loss * found.run.value, u32(max(end - number, 0.0)));
-        }
+    } else {
+        pass_samples(field, local, 0.0, span.y - start, &passing);
     }
     return passing.share;
 }
