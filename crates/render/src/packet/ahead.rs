@@ -9,8 +9,8 @@ use crate::blocks::Blocks;
 use crate::gather::prefetch;
 use crate::walk::SPECIAL;
 
-/// Each so many turns, it is seen which bricks rays come to.
-const LOOK_AHEAD_EACH: u32 = 8;
+/// It is seen which bricks rays come to each so many turns of a voxel or less.
+pub(super) const EACH_VOXELS: u32 = 8;
 
 /// How far ahead is looked, in layers of voxels: a brick and a half.
 const AHEAD_VOXELS: f32 = 12.0;
@@ -21,6 +21,7 @@ const ASKED: usize = 16;
 /// The bricks that were asked for. They are asked for whole, since rays beside each other read most of one.
 pub(super) struct Asked {
     turn: u32,
+    each_turns: u32,
     /// The last ones, by the low bits of their numbers.
     bricks: [i32; ASKED],
 }
@@ -33,8 +34,9 @@ pub(super) fn ahead_of<S: Simd>(lanes: &Lanes<'_, S>) -> f32x16<S> {
 }
 
 impl Asked {
-    pub(super) fn new() -> Asked {
-        Asked { turn: 0, bricks: [-1; ASKED] }
+    /// Looks ahead each so many turns.
+    pub(super) fn new(each_turns: u32) -> Asked {
+        Asked { turn: 0, each_turns, bricks: [-1; ASKED] }
     }
 
     /// Calls with each brick in which rays are at `t`, but for those it was called with of late; not at every turn.
@@ -46,7 +48,7 @@ impl Asked {
         mut ask: impl FnMut(usize),
     ) {
         self.turn = self.turn.wrapping_add(1);
-        if !self.turn.is_multiple_of(LOOK_AHEAD_EACH) {
+        if !self.turn.is_multiple_of(self.each_turns) {
             return;
         }
         let cells = lanes.cells(bricks_of(lanes.at(t)), t.simd_lt(lanes.ends));

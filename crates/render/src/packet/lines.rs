@@ -3,7 +3,7 @@
 use fearless_simd::{Level, Simd, dispatch, f32x16, i32x16, mask32x16, prelude::*};
 use nuage_volume::brick::Bricks;
 
-use super::ahead::{Asked, ahead_of, ask_for_block, ask_for_brick};
+use super::ahead::{Asked, EACH_VOXELS, ahead_of, ask_for_block, ask_for_brick};
 use super::{Lanes, Packet, RAYS, Stretch, bricks_of, each_ray, interpolate, to_int};
 use crate::blocks::Blocks;
 use crate::camera::Ray;
@@ -130,7 +130,7 @@ fn places_of<S: Simd>(simd: S, cells: i32x16<S>, voxels: [i32x16<S>; 3]) -> i32x
 fn integrate_voxels<S: Simd, V: Stored>(lanes: &Lanes<'_, S>, values: &[V]) -> [f32; RAYS] {
     let (none, mut depth) = (mask32x16::splat(lanes.simd, false), lanes.splat(0.0));
     let ahead = ahead_of(lanes);
-    let mut asked = Asked::new();
+    let mut asked = Asked::new(EACH_VOXELS);
     lanes.each_stretch(
         #[inline(always)]
         |stretch| {
@@ -151,7 +151,7 @@ fn integrate_cells<'a, S: Simd>(
     blocks: &mut Blocks<'a>,
 ) -> [f32; RAYS] {
     let (none, mut depth) = (mask32x16::splat(lanes.simd, false), lanes.splat(0.0));
-    let (ahead, mut asked) = (ahead_of(lanes), Asked::new());
+    let (ahead, mut asked) = (ahead_of(lanes), Asked::new(EACH_VOXELS));
     lanes.each_stretch(
         #[inline(always)]
         |stretch| {
@@ -185,7 +185,7 @@ fn sample_cells<'a, S: Simd>(
     let (per_step, loss) = (one / steps, steps * extinction);
     let none = mask32x16::splat(lanes.simd, false);
     let (mut number, mut passes) = (zero, one);
-    let (ahead, mut asked) = (ahead_of(lanes), Asked::new());
+    let (ahead, mut asked) = (ahead_of(lanes), Asked::new(EACH_VOXELS));
     lanes.each_stretch(
         #[inline(always)]
         |stretch| {
@@ -225,7 +225,7 @@ fn sample_voxels<S: Simd, V: Stored>(
     extinction: f32,
 ) -> [f32; RAYS] {
     let (one, per_step, loss) = (lanes.splat(1.0), lanes.splat(1.0) / steps, steps * extinction);
-    let (mut number, mut passes, mut asked) = (lanes.splat(0.0), one, Asked::new());
+    let (mut number, mut passes, mut asked) = (lanes.splat(0.0), one, Asked::new(2 * EACH_VOXELS));
     let ahead = ahead_of(lanes);
     loop {
         let t = number * steps;
