@@ -26,6 +26,7 @@ use nuage_render::filter::Filter;
 use nuage_render::light::{Light, Sky, Sun};
 use nuage_render::march::Quality;
 use nuage_render::scene::Phase;
+use nuage_testkit::clock::processor_ms;
 use nuage_volume::format::Asset;
 
 /// Per voxel at density 1.
@@ -226,25 +227,15 @@ fn device() -> Result<Gpu, Failure> {
     Ok(Gpu::from_host(device, queue, adapter.get_info().name))
 }
 
-/// The time that all threads of this program were running, in milliseconds, where the system tells.
-fn cpu_ms() -> f64 {
-    let threads = std::fs::read_dir("/proc/self/task").into_iter().flatten().flatten();
-    let nanoseconds = threads.filter_map(|thread| {
-        let text = std::fs::read_to_string(thread.path().join("schedstat")).ok()?;
-        text.split_whitespace().next()?.parse::<f64>().ok()
-    });
-    nanoseconds.sum::<f64>() * 1e-6
-}
-
 /// Wall and processor milliseconds of each run of one side.
 #[derive(Default)]
 struct Times([Vec<f64>; 2]);
 
 impl Times {
     fn add(&mut self, run: impl FnOnce() -> Result<(), Failure>) -> Result<(), Failure> {
-        let (wall, cpu) = (Instant::now(), cpu_ms());
+        let (wall, cpu) = (Instant::now(), processor_ms());
         run()?;
-        self.0[1].push(cpu_ms() - cpu);
+        self.0[1].push(processor_ms() - cpu);
         self.0[0].push(wall.elapsed().as_secs_f64() * 1e3);
         Ok(())
     }

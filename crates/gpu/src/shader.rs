@@ -324,6 +324,16 @@ impl Source {
         );
         let sky_map = if features.sky_map[0] { file!("envmap") } else { file!("even_sky") };
         let media = if features.is_one_grid() { file!("one_grid") } else { file!("media") };
+        let marching = [
+            file!("camera"),
+            file!("emission"),
+            end,
+            kind,
+            file!("cells"),
+            file!("depth"),
+            &voxel_depth,
+            file!("march"),
+        ];
         let own: &[&str] = match self {
             Source::Views => &[
                 file!("camera"),
@@ -336,27 +346,8 @@ impl Source {
                 &samples,
             ],
             Source::Surface => &[file!("camera"), file!("cells"), file!("surface")],
-            Source::March => &[
-                file!("camera"),
-                file!("emission"),
-                end,
-                kind,
-                file!("cells"),
-                file!("depth"),
-                &voxel_depth,
-                file!("march"),
-            ],
-            Source::Shadow => &[
-                file!("camera"),
-                file!("emission"),
-                end,
-                file!("still"),
-                file!("cells"),
-                file!("depth"),
-                &voxel_depth,
-                file!("march"),
-                file!("shadow"),
-            ],
+            Source::March => &marching,
+            Source::Shadow => &[&marching[..], &[file!("shadow")]].concat(),
             Source::LightVolume => &[file!("camera"), file!("light_volume")],
             Source::Upsample => &[file!("camera"), end, file!("upsample")],
             Source::Accumulate => &[file!("camera"), end, file!("accumulate")],

@@ -12,8 +12,6 @@
 
 use std::error::Error;
 use std::hint::black_box;
-use std::sync::OnceLock;
-use std::time::Instant;
 
 use glam::{DAffine3, DVec2, DVec3, IVec3, Vec3};
 use half::f16;
@@ -22,6 +20,7 @@ use nuage_render::filter::Filter;
 use nuage_render::hash::{hash_u32, unit_f32};
 use nuage_render::packet::{RAYS, SIDE, first_collisions, optical_depths, square, stepped_transmittances};
 use nuage_render::traverse::{Field, Reader};
+use nuage_testkit::clock::processor_ms;
 use nuage_volume::accessor::Accessor;
 use nuage_volume::brick::{BrickSummary, Bricks};
 use nuage_volume::build::TreeBuilder;
@@ -134,23 +133,15 @@ fn met<'a>(field: &Field<'a>, accessor: &mut Accessor<'a>, ray: &Ray) -> [f64; 3
     [bricks, length * f64::from(direction.length()), length * f64::from(along)]
 }
 
-/// The nanoseconds for which this thread has had a processor; on systems that do not tell, those since the first call.
-fn processor_ns() -> f64 {
-    static FIRST: OnceLock<Instant> = OnceLock::new();
-    let told = std::fs::read_to_string("/proc/thread-self/schedstat").ok();
-    let told = told.and_then(|line| line.split_whitespace().next()?.parse().ok());
-    told.unwrap_or_else(|| FIRST.get_or_init(Instant::now).elapsed().as_secs_f64() * 1e9)
-}
-
 /// The nanoseconds of a cycle now.
 fn cycle_ns() -> f64 {
     const PRODUCTS: u32 = 1 << 27;
     let factor = black_box(0xbf58_476d_1ce4_e5b9_u64);
-    let begin = processor_ns();
+    let begin = processor_ms();
     // Each product waits for the one before.
     let product = (0..PRODUCTS).fold(factor, |product, i| product.wrapping_mul(factor) ^ u64::from(i));
     black_box(product);
-    (processor_ns() - begin) / f64::from(PRODUCTS) / CHAIN_CYCLES
+    (processor_ms() - begin) * 1e6 / f64::from(PRODUCTS) / CHAIN_CYCLES
 }
 
 fn median(mut values: Vec<f64>) -> f64 {
@@ -162,14 +153,14 @@ fn median(mut values: Vec<f64>) -> f64 {
 fn ray_ns<'a>(kernel: &str, field: &Field<'a>, rays: &[Ray]) -> f64 {
     let mut reader = field.reader();
     let mut ns_of = |passes: u32| {
-        let begin = processor_ns();
+        let begin = processor_ms();
         for pass in 0..passes {
             let packets = rays.as_chunks::<RAYS>().0.iter().zip(0..);
             let sum: f32 =
                 packets.map(|(rays, i)| work(kernel, field, &mut reader, rays, 1024 * i + pass)).sum();
             black_box(sum);
         }
-        (processor_ns() - begin) / f64::from(passes)
+        (processor_ms() - begin) * 1e6 / f64::from(passes)
     };
     // Bricks are decoded by the first who meets them.
     ns_of(1);

@@ -19,6 +19,7 @@ use nuage_render::packet::{
     RAYS, SIDE, Surface, first_collisions, first_voxels, optical_depths, square, stepped_transmittances,
 };
 use nuage_render::traverse::{Field, Reader};
+use nuage_testkit::clock::processor_ms;
 use nuage_volume::channel::Channel;
 use rayon::prelude::*;
 
@@ -61,16 +62,6 @@ fn picture<'a>(field: &Field<'a>, size: u32, kernel: &Kernel<'_, 'a>, tiles: &mu
         },
     );
     begin.elapsed().as_secs_f64() * 1e3
-}
-
-/// The time that all threads of this program were running, in milliseconds, where the system tells.
-fn cpu_ms() -> f64 {
-    let threads = std::fs::read_dir("/proc/self/task").into_iter().flatten().flatten();
-    let nanoseconds = threads.filter_map(|thread| {
-        let text = std::fs::read_to_string(thread.path().join("schedstat")).ok()?;
-        text.split_whitespace().next()?.parse::<f64>().ok()
-    });
-    nanoseconds.sum::<f64>() * 1e-6
 }
 
 fn median(values: &mut [f64]) -> f64 {
@@ -178,11 +169,11 @@ fn main() -> Result<(), Box<dyn Error>> {
     let (mut times, mut cpu_times) = (Vec::new(), Vec::new());
     let mut tiles = vec![[0.0; (TILE * TILE) as usize]; size.div_ceil(TILE).pow(2) as usize];
     for turn in 0..=repeats {
-        let cpu = cpu_ms();
+        let cpu = processor_ms();
         let time = pool.install(|| picture(&field, size, &kernel, &mut tiles));
         if turn > 0 {
             times.push(time);
-            cpu_times.push(cpu_ms() - cpu);
+            cpu_times.push(processor_ms() - cpu);
         }
     }
     if times.is_empty() {

@@ -13,6 +13,7 @@ use std::path::{Path, PathBuf};
 use serde_json::Value;
 
 pub mod blocks;
+pub mod clock;
 pub mod npy;
 pub mod synthetic;
 
