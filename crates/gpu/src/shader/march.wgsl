@@ -33,57 +33,250 @@ fn next_step(steps: ptr<function, Steps>) -> vec2<f32> {
 // Steps that are lit together: what they scatter of the camera's light, the same times t, and where they begin.
 struct Group { share: f32, moment: f32, start: f32 }
 
-// The light on the medium along one camera ray.
-struct Lighting {
-    // What shadow rays meet, and the camera ray there.
-    field: u32,
-    view: vec3<f32>,
-    ray: LocalRay,
-    voxels_to_start: f32,
-    voxels_per_length: f32,
-    sun: vec3<f32>,
-    sun_direction: vec3<f32>,
-    has_sun: bool,
+// How far a camera ray has got: what is kept while a shadow ray is followed. All else is made anew from the pixel, so that
+// registers are free for the shadow ray.
+struct Progress {
+    has_begun: bool,
+    // Where the walks through the densities and through what glows stand, and what is left of the runs that they found.
+    brick: vec3<i32>,
+    t: f32,
+    t_end: f32,
+    head: FoundRun,
+    glow_brick: vec3<i32>,
+    glow_t: f32,
+    glow_t_end: f32,
+    glow_head: FoundRun,
+    // How many pieces there are still in a stretch of one value.
+    pieces_left: f32,
+    // The step that is being lit, the share of the camera's light that it takes, and up to where it is lit by the sun.
+    step: vec2<f32>,
+    share: f32,
+    lit: f32,
     group: Group,
-    sky: vec3<f32>,
-    has_sky: bool,
+    // The share that all steps before took, and that at which the next ray goes to the sky.
+    taken: f32,
     next_sky: f32,
-    scattered: f32,
     sky_index: u32,
-    random: u32,
+    transmittance: f32,
+    // Sums over all rays of the pixel: light, and the distances of steps, each times the share that it took.
+    scattered: vec3<f32>,
+    depth_moment: f32,
 }
 
-// What shadow rays remember.
-var<private> shadow_accessor: Accessor;
+// A ray to a light, and what the light that passes along it is worth; without its colour.
+struct ShadowRay { is_there: bool, is_to_sky: bool, worth: f32, ray: LocalRay, shift: f32 }
 
-fn new_lighting(ray: Ray, start: f32, local: LocalRay, random: u32, shift: f32) -> Lighting {
-    let field = field_of(SHADOW_CHANNEL);
-    var lighting: Lighting;
-    lighting.field = field;
-    lighting.view = ray.direction;
-    lighting.ray = local;
-    if (SHADOW_CHANNEL != DENSITY_CHANNEL) {
-        lighting.ray = moved(field, ray, start);
+// Goes on along a camera ray to where the next shadow ray begins. Steps begin at a part `shift` of one.
+fn next_shadow_ray(progress: ptr<function, Progress>, ray: Ray, max_distance: f32, random: u32, shift: f32) -> ShadowRay {
+    var found = ShadowRay(false, false, 0.0, LocalRay(vec3<f32>(0.0), vec3<f32>(0.0), vec3<f32>(0.0)), 0.0);
+    let density = field_of(DENSITY_CHANNEL);
+    let glow = field_of(GLOW_CHANNEL);
+    var density_span = field_interval(density, in_field(density, ray), 0.0);
+    density_span.y = min(density_span.y, max_distance);
+    let has_density = density_span.x < density_span.y;
+    var glow_span = vec2<f32>(0.0);
+    if (HAS_EMISSION) {
+        glow_span = field_interval(glow, in_field(glow, ray), 0.0);
+        glow_span.y = min(glow_span.y, max_distance);
     }
-    lighting.voxels_per_length = length(local.direction);
-    lighting.voxels_to_start = start * lighting.voxels_per_length;
-    let phase = params.media[0].phase;
-    let scatters = phase_between(phase, params.sun_direction.xyz, ray.direction);
-    lighting.sun = params.sun_irradiance.xyz * params.media[0].albedo.xyz * scatters;
-    lighting.has_sun = any(lighting.sun != vec3<f32>(0.0));
-    lighting.sun_direction = directions(field, params.sun_direction.xyz);
-    lighting.sky = params.sky_zenith.xyz * params.media[0].albedo.xyz;
-    lighting.has_sky = any(lighting.sky != vec3<f32>(0.0)) && params.march_rays.y > 0.0;
-    lighting.next_sky = sky_shift(random, shift) / max(params.march_rays.y, 1.0);
-    lighting.random = random;
-    return lighting;
+    let has_glow = glow_span.x < glow_span.y;
+    if (!has_density && !has_glow) {
+        (*progress).transmittance = 1.0;
+        return found;
+    }
+    let start = min(select(MAX_F32, density_span.x, has_density), select(MAX_F32, glow_span.x, has_glow));
+    let local = moved(density, ray, start);
+    let glow_local = moved(glow, ray, start);
+    let voxels_per_length = max(
+        select(0.0, length(local.direction), has_density), select(0.0, length(glow_local.direction), has_glow),
+    );
+    let step_length = params.march.x / voxels_per_length;
+    let lattice = Lattice(step_length, fract(shift - start / step_length), 0.0);
+    let scatters = phase_between(params.media[0].phase, params.sun_direction.xyz, ray.direction);
+    let has_sun = has_density && scatters > 0.0
+        && any(params.sun_irradiance.xyz * params.media[0].albedo.xyz != vec3<f32>(0.0));
+    let has_sky = has_density && params.march_rays.y > 0.0
+        && any(params.sky_zenith.xyz * params.media[0].albedo.xyz != vec3<f32>(0.0));
+    let scale = params.media[0].extinction.x;
+    let shadow_field = field_of(SHADOW_CHANNEL);
+    var shadow_local = local;
+    if (SHADOW_CHANNEL != DENSITY_CHANNEL) {
+        shadow_local = moved(shadow_field, ray, start);
+    }
+    let voxels_of_density = length(local.direction);
+
+    if (!(*progress).has_begun) {
+        let before = *progress;
+        var begun: Progress;
+        begun.has_begun = true;
+        begun.scattered = before.scattered;
+        begun.depth_moment = before.depth_moment;
+        begun.transmittance = 1.0;
+        begun.next_sky = sky_shift(random, shift) / max(params.march_rays.y, 1.0);
+        let span = density_span - start;
+        let runs = runs_between(density, local, span.x, select(span.x, span.y, has_density));
+        begun.brick = runs.brick;
+        begun.t = runs.t;
+        begun.t_end = runs.t_end;
+        begun.head.is_there = true;
+        if (HAS_EMISSION) {
+            let span = glow_span - start;
+            let runs = runs_between(glow, glow_local, span.x, select(span.x, span.y, has_glow));
+            begun.glow_brick = runs.brick;
+            begun.glow_t = runs.t;
+            begun.glow_t_end = runs.t_end;
+            begun.glow_head.is_there = true;
+        }
+        *progress = begun;
+    }
+    var now = *progress;
+    var walker = new_accessor();
+    var glow_walker = new_accessor();
+    var runs = Runs(density, local, now.brick, now.t, now.t_end, MAX_ROOT_LEAPS, MAX_LEAPS);
+    var glow_runs = Runs(glow, glow_local, now.glow_brick, now.glow_t, now.glow_t_end, MAX_ROOT_LEAPS, MAX_LEAPS);
+    let full = 1.0 / params.march_rays.x;
+    var t = 0.0;
+    loop {
+        var is_over = false;
+        if (now.lit >= now.step.y && !(has_sky && now.taken + now.share > now.next_sky)) {
+            // The next step, of the runs of both channels, cut where either begins or ends.
+            now.taken += now.share;
+            now.share = 0.0;
+            if (now.head.is_there && now.head.run.t0 >= now.head.run.t1) {
+                now.head = next_run(&runs, &walker);
+            }
+            if (HAS_EMISSION && now.glow_head.is_there && now.glow_head.run.t0 >= now.glow_head.run.t1) {
+                now.glow_head = next_run(&glow_runs, &glow_walker);
+            }
+            is_over = !(now.head.is_there || now.glow_head.is_there) || now.transmittance <= params.march.w;
+            if (!is_over) {
+                let head = now.head.run;
+                let glow_head = now.glow_head.run;
+                let t0 = min(select(MAX_F32, head.t0, now.head.is_there), select(MAX_F32, glow_head.t0, now.glow_head.is_there));
+                let is_dense = now.head.is_there && head.t0 <= t0;
+                let glows = now.glow_head.is_there && glow_head.t0 <= t0;
+                let t1 = min(
+                    select(MAX_F32, select(head.t0, head.t1, is_dense), now.head.is_there),
+                    select(MAX_F32, select(glow_head.t0, glow_head.t1, glows), now.glow_head.is_there),
+                );
+                let density_varies = is_dense && head.is_varying;
+                let glow_varies = glows && glow_head.is_varying;
+                var value = select(0.0, head.value, is_dense);
+                // Steps of the lattice where something varies, else pieces short enough to be lit.
+                var end = t1;
+                if (density_varies || glow_varies) {
+                    var steps = steps_between(lattice, t0, t1);
+                    end = next_step(&steps).y;
+                } else {
+                    if (now.pieces_left <= 0.0) {
+                        let piece_depth = value * scale * (t1 - t0);
+                        let wanted = max(piece_depth / LIT_PIECE_DEPTH, (t1 - t0) * voxels_per_length / LIT_PIECE_VOXELS);
+                        let is_lit = (has_sun || has_sky) && piece_depth > 0.0;
+                        now.pieces_left = select(1.0, clamp(ceil(wanted), 1.0, MOST_PIECES), is_lit);
+                    }
+                    end = select(t1, t0 + (t1 - t0) / now.pieces_left, now.pieces_left > 1.0);
+                    now.pieces_left -= 1.0;
+                }
+                now.head.run.t0 = select(head.t0, end, is_dense);
+                now.glow_head.run.t0 = select(glow_head.t0, end, glows);
+                let middle = 0.5 * (t0 + end);
+                if (density_varies) {
+                    value = look_up(LOOKUP, density, &walker, ray_at(local, middle), three(random ^ bitcast<u32>(middle)));
+                }
+                let length = end - t0;
+                let depth = min(value * scale * length, MAX_F32);
+                let absorbed = one_minus_exp_neg(depth);
+                if (HAS_EMISSION && glows) {
+                    var glow_value = glow_head.value;
+                    if (glow_varies) {
+                        glow_value = look_up(MEAN_LOOKUP, glow, &glow_walker, ray_at(glow_local, middle), vec3<f32>(0.0));
+                    }
+                    let emitted = spectrum_radiance(params.media[0].emission, glow_value);
+                    let seen = select(length * (absorbed / max(depth, MIN_F32)), length, depth <= 0.0);
+                    now.scattered += now.transmittance * seen * emitted;
+                }
+                now.step = vec2<f32>(t0, end);
+                now.share = now.transmittance * absorbed;
+                now.lit = select(end, t0, has_sun && now.share > 0.0);
+                now.depth_moment += now.share * (start + middle);
+                now.transmittance *= 1.0 - absorbed;
+            }
+        }
+        if (now.lit < now.step.y || is_over) {
+            // Lit by the sun in groups. One is full in the midst of a step: what changes little is divided nearly the same.
+            let begin = now.lit;
+            var end = now.step.y;
+            if (!is_over) {
+                let missing = (full - now.group.share) / max(now.share, MIN_F32);
+                let cut = now.step.x + missing * (now.step.y - now.step.x);
+                let is_cut = begin == now.step.x && missing < 1.0 && now.share < full && cut > begin && cut < end;
+                end = select(end, cut, is_cut);
+                if (now.group.share == 0.0) {
+                    now.group.start = begin;
+                }
+                let part = now.share * ((end - begin) / (now.step.y - now.step.x));
+                now.group.share += part;
+                now.group.moment += part * 0.5 * (begin + end);
+            }
+            now.lit = end;
+            let longest = select(GROUP_VOXELS, FAINT_GROUP_VOXELS, now.group.share < FAINT_GROUP * full);
+            let is_full = now.group.share >= full || end < now.step.y;
+            let is_long = end - now.group.start >= longest / voxels_of_density;
+            if ((is_full || is_long || is_over) && now.group.share > 0.0) {
+                found.worth = now.group.share * scatters;
+                t = now.group.moment / now.group.share;
+                now.group = Group(0.0, 0.0, 0.0);
+                if (!HAS_LIGHT_VOLUME) {
+                    found.is_there = true;
+                    break;
+                }
+                let sun = params.sun_irradiance.xyz * params.media[0].albedo.xyz;
+                now.scattered += sun * (found.worth * cached_transmittance(ray_at(shadow_local, t)));
+            }
+            if (is_over) {
+                break;
+            }
+        } else if (has_sky && now.taken + now.share > now.next_sky) {
+            let part = clamp((now.next_sky - now.taken) / now.share, 0.0, 1.0);
+            t = now.step.x + part * (now.step.y - now.step.x);
+            now.next_sky += 1.0 / params.march_rays.y;
+            now.sky_index += 1u;
+            found.worth = 1.0 / params.march_rays.y;
+            found.is_there = true;
+            found.is_to_sky = true;
+            break;
+        }
+    }
+    now.brick = runs.brick;
+    now.t = runs.t;
+    now.t_end = runs.t_end;
+    now.glow_brick = glow_runs.brick;
+    now.glow_t = glow_runs.t;
+    now.glow_t_end = glow_runs.t_end;
+    *progress = now;
+
+    let voxel = u32(i32(floor((start + t) * voxels_of_density)));
+    found.shift = unit_f32(hash_u32(random ^ hash_u32(voxel ^ (now.sky_index << 24u))));
+    var direction = params.sun_direction.xyz;
+    if (found.is_to_sky) {
+        direction = sky_direction(ray.direction, random, now.sky_index - 1u);
+    }
+    found.ray = local_ray(ray_at(shadow_local, t), directions(shadow_field, direction));
+    return found;
+}
+
+// A direction towards the sky, drawn from the phase function.
+fn sky_direction(view: vec3<f32>, random: u32, index: u32) -> vec3<f32> {
+    let start = hash_u32(random ^ SKY_DIRECTION_SEED);
+    let u = vec2<f32>(unit_f32(start + index * PLASTIC_X), unit_f32(hash_u32(start) + index * PLASTIC_Y));
+    return sample_phase(params.media[0].phase, view, u);
 }
 
 // The optical depth of a ray up to `end`, given up once it passes `limit`.
 fn optical_depth(field: u32, ray: LocalRay, end: f32, lattice: Lattice, scale: f32, limit: f32) -> f32 {
     var depth = 0.0;
     let seed = hash_u32(bitcast<u32>(lattice.shift));
-    var accessor = shadow_accessor;
+    var accessor = new_accessor();
     var runs = runs_between(field, ray, 0.0, end);
     loop {
         let found = next_run(&runs, &accessor);
@@ -111,7 +304,6 @@ fn optical_depth(field: u32, ray: LocalRay, end: f32, lattice: Lattice, scale: f
             break;
         }
     }
-    shadow_accessor = accessor;
     return depth;
 }
 
@@ -126,232 +318,21 @@ fn exact_transmittance(field: u32, ray: LocalRay) -> f32 {
     return exp_(-params.media[0].extinction.x * depth);
 }
 
-// The share of the light from a direction that gets to a place on the camera ray.
-fn march_transmittance(lighting: ptr<function, Lighting>, t: f32, direction: vec3<f32>) -> f32 {
-    let ray = local_ray(ray_at((*lighting).ray, t), direction);
+// The light from the end of a shadow ray that gets to where it begins, and from there to the camera.
+fn light_through(shadow: ShadowRay) -> vec3<f32> {
+    let field = field_of(SHADOW_CHANNEL);
+    var passes: f32;
     if (HAS_EXACT_SHADOWS) {
-        return exact_transmittance((*lighting).field, ray);
+        passes = exact_transmittance(field, shadow.ray);
+    } else {
+        let step = params.march.y / length(shadow.ray.direction);
+        let lattice = Lattice(step, shadow.shift, params.march.z / step);
+        let end = field_exit(field, shadow.ray);
+        let scale = params.media[0].extinction.x;
+        passes = exp_(-optical_depth(field, shadow.ray, end, lattice, scale, params.march_rays.z));
     }
-    let voxel = u32(i32(floor((*lighting).voxels_to_start + t * (*lighting).voxels_per_length)));
-    let shift = unit_f32(hash_u32((*lighting).random ^ hash_u32(voxel ^ ((*lighting).sky_index << 24u))));
-    let step = params.march.y / length(direction);
-    let lattice = Lattice(step, shift, params.march.z / step);
-    let end = field_exit((*lighting).field, ray);
-    let depth = optical_depth((*lighting).field, ray, end, lattice, params.media[0].extinction.x, params.march_rays.z);
-    return exp_(-depth);
-}
-
-// The next direction towards the sky, in the field's positions, drawn from the phase function.
-fn sky_direction(lighting: ptr<function, Lighting>) -> vec3<f32> {
-    let start = hash_u32((*lighting).random ^ SKY_DIRECTION_SEED);
-    let index = (*lighting).sky_index;
-    let u = vec2<f32>(unit_f32(start + index * PLASTIC_X), unit_f32(hash_u32(start) + index * PLASTIC_Y));
-    (*lighting).sky_index += 1u;
-    return directions((*lighting).field, sample_phase(params.media[0].phase, (*lighting).view, u));
-}
-
-// The light scattered towards the camera by a step that accounts for `share` of the camera's light, or by a group of
-// steps that ends with it. The last step accounts for nothing, and ends what is left of a group.
-fn step_light(lighting: ptr<function, Lighting>, t0: f32, t1: f32, share: f32, is_last: bool) -> vec3<f32> {
-    var light = vec3<f32>(0.0);
-    let full = 1.0 / params.march_rays.x;
-    let missing = (full - (*lighting).group.share) / max(share, MIN_F32);
-    // A group is full in the midst of a step: what changes little is divided nearly the same.
-    let cut = select(t1, t0 + missing * (t1 - t0), missing < 1.0 && share < full && !is_last);
-    let before = (*lighting).scattered;
-    (*lighting).scattered += share;
-    // The parts of the step before and after the cut, then rays to the sky: one shadow ray at most in each turn.
-    var part = select(2u, 0u, (*lighting).has_sun);
-    loop {
-        var radiance = vec3<f32>(0.0);
-        var t = 0.0;
-        var direction = (*lighting).sun_direction;
-        if (part < 2u) {
-            let begin = select(t0, cut, part == 1u);
-            let end = select(cut, t1, part == 1u);
-            part += 1u;
-            if (begin >= end && !is_last) {
-                continue;
-            }
-            if ((*lighting).group.share == 0.0) {
-                (*lighting).group.start = begin;
-            }
-            if (!is_last) {
-                let part_share = share * ((end - begin) / (t1 - t0));
-                (*lighting).group.share += part_share;
-                (*lighting).group.moment += part_share * 0.5 * (begin + end);
-            }
-            let group = (*lighting).group;
-            let is_full = group.share >= full || (end == cut && cut < t1);
-            let longest = select(GROUP_VOXELS, FAINT_GROUP_VOXELS, group.share < FAINT_GROUP * full);
-            let is_long = end - group.start >= longest / (*lighting).voxels_per_length;
-            if (!(is_full || is_long || is_last)) {
-                continue;
-            }
-            (*lighting).group = Group(0.0, 0.0, 0.0);
-            if (group.share <= 0.0) {
-                continue;
-            }
-            radiance = (*lighting).sun * group.share;
-            t = group.moment / group.share;
-            if (HAS_LIGHT_VOLUME) {
-                light += radiance * cached_transmittance(ray_at((*lighting).ray, t));
-                continue;
-            }
-        } else {
-            if (!(*lighting).has_sky || (*lighting).scattered <= (*lighting).next_sky) {
-                break;
-            }
-            let rays = params.march_rays.y;
-            t = t0 + clamp(((*lighting).next_sky - before) / share, 0.0, 1.0) * (t1 - t0);
-            (*lighting).next_sky += 1.0 / rays;
-            direction = sky_direction(lighting);
-            radiance = (*lighting).sky / rays;
-        }
-        light += radiance * march_transmittance(lighting, t, direction);
-    }
-    return light;
-}
-
-// How far away the steps of the last ray were, each times the share of the camera's light that it took.
-var<private> depth_moment: f32;
-
-// The light from the medium along a ray, and the share of the light behind it that passes. Steps begin at a part `shift` of
-// one.
-fn march_radiance(ray: Ray, max_distance: f32, random: u32, shift: f32) -> vec4<f32> {
-    depth_moment = 0.0;
-    var scattered = vec3<f32>(0.0);
-    var transmittance = 1.0;
-    let density = field_of(DENSITY_CHANNEL);
-    let glow = field_of(GLOW_CHANNEL);
-    var density_span = field_interval(density, in_field(density, ray), 0.0);
-    density_span.y = min(density_span.y, max_distance);
-    let has_density = density_span.x < density_span.y;
-    var glow_span = vec2<f32>(0.0);
-    if (HAS_EMISSION) {
-        glow_span = field_interval(glow, in_field(glow, ray), 0.0);
-        glow_span.y = min(glow_span.y, max_distance);
-    }
-    let has_glow = glow_span.x < glow_span.y;
-    if (!has_density && !has_glow) {
-        return vec4<f32>(scattered, transmittance);
-    }
-    let start = min(select(MAX_F32, density_span.x, has_density), select(MAX_F32, glow_span.x, has_glow));
-    density_span = density_span - start;
-    glow_span = glow_span - start;
-    let local = moved(density, ray, start);
-    let glow_local = moved(glow, ray, start);
-    let voxels_per_length = max(
-        select(0.0, length(local.direction), has_density), select(0.0, length(glow_local.direction), has_glow),
-    );
-    let step_length = params.march.x / voxels_per_length;
-    let lattice = Lattice(step_length, fract(shift - start / step_length), 0.0);
-    var lighting = new_lighting(ray, start, local, random, shift);
-    lighting.has_sun = lighting.has_sun && has_density;
-    lighting.has_sky = lighting.has_sky && has_density;
-    let is_lit = lighting.has_sun || lighting.has_sky;
-    let scale = params.media[0].extinction.x;
-
-    var walker = new_accessor();
-    var glow_walker = new_accessor();
-    shadow_accessor = new_accessor();
-    var runs = runs_between(density, local, density_span.x, select(density_span.x, density_span.y, has_density));
-    var glow_runs = runs_between(glow, glow_local, glow_span.x, select(glow_span.x, glow_span.y, has_glow));
-    // The runs of both channels, cut where either begins or ends, and a last turn that ends what is lit together.
-    var head = FoundRun(true, Run(0.0, 0.0, false, 0.0));
-    var glow_head = FoundRun(HAS_EMISSION, Run(0.0, 0.0, false, 0.0));
-    var is_last = false;
-    while (!is_last) {
-        if (head.is_there && head.run.t0 >= head.run.t1) {
-            head = next_run(&runs, &walker);
-        }
-        if (HAS_EMISSION && glow_head.is_there && glow_head.run.t0 >= glow_head.run.t1) {
-            glow_head = next_run(&glow_runs, &glow_walker);
-        }
-        is_last = !(head.is_there || glow_head.is_there) || transmittance <= params.march.w;
-        // The next piece: it ends where a run that covers its start ends, or where another begins.
-        let t0 = min(select(MAX_F32, head.run.t0, head.is_there), select(MAX_F32, glow_head.run.t0, glow_head.is_there));
-        let is_dense = !is_last && head.is_there && head.run.t0 <= t0;
-        let glows = !is_last && glow_head.is_there && glow_head.run.t0 <= t0;
-        var t1 = MAX_F32;
-        if (head.is_there) {
-            t1 = select(head.run.t0, head.run.t1, is_dense);
-        }
-        if (glow_head.is_there) {
-            t1 = min(t1, select(glow_head.run.t0, glow_head.run.t1, glows));
-        }
-        let density_varies = is_dense && head.run.is_varying;
-        let glow_varies = glows && glow_head.run.is_varying;
-        let constant_density = select(0.0, head.run.value, is_dense);
-        let constant_glow = select(0.0, glow_head.run.value, glows);
-
-        // Steps of the lattice where something varies, else pieces short enough to be lit.
-        let is_varying = density_varies || glow_varies;
-        var steps = steps_between(lattice, t0, t1);
-        var pieces = 1.0;
-        let piece_depth = constant_density * scale * (t1 - t0);
-        if (!is_varying && is_lit && piece_depth > 0.0) {
-            let wanted = max(piece_depth / LIT_PIECE_DEPTH, (t1 - t0) * voxels_per_length / LIT_PIECE_VOXELS);
-            pieces = clamp(ceil(wanted), 1.0, MOST_PIECES);
-        }
-        var piece = 0.0;
-        loop {
-            var step: vec2<f32>;
-            if (is_varying) {
-                step = next_step(&steps);
-                if (step.x >= step.y) {
-                    break;
-                }
-            } else {
-                if (piece >= pieces) {
-                    break;
-                }
-                let length = t1 - t0;
-                step = vec2<f32>(
-                    select(t1, t0 + length * (piece / pieces), piece < pieces),
-                    select(t1, t0 + length * ((piece + 1.0) / pieces), piece + 1.0 < pieces),
-                );
-                piece += 1.0;
-            }
-            let t = 0.5 * (step.x + step.y);
-            var value = constant_density;
-            if (density_varies) {
-                value = look_up(LOOKUP, density, &walker, ray_at(local, t), three(random ^ bitcast<u32>(t)));
-            }
-            var emitted = vec3<f32>(0.0);
-            if (HAS_EMISSION && glows) {
-                var glow_value = constant_glow;
-                if (glow_varies) {
-                    glow_value = look_up(MEAN_LOOKUP, glow, &glow_walker, ray_at(glow_local, t), vec3<f32>(0.0));
-                }
-                emitted = spectrum_radiance(params.media[0].emission, glow_value);
-            }
-            let length = step.y - step.x;
-            let depth = min(value * scale * length, MAX_F32);
-            if (depth <= 0.0 && !is_last) {
-                scattered += transmittance * length * emitted;
-                continue;
-            }
-            let absorbed = one_minus_exp_neg(depth);
-            let share = transmittance * absorbed;
-            depth_moment += share * (start + t);
-            if (is_lit) {
-                scattered += step_light(&lighting, step.x, step.y, share, is_last);
-            }
-            if (is_last) {
-                break;
-            }
-            scattered += transmittance * (length * (absorbed / depth)) * emitted;
-            transmittance *= 1.0 - absorbed;
-            if (transmittance <= params.march.w) {
-                break;
-            }
-        }
-
-        head.run.t0 = select(head.run.t0, t1, is_dense);
-        glow_head.run.t0 = select(glow_head.run.t0, t1, glows);
-    }
-    return vec4<f32>(scattered, transmittance);
+    let colour = select(params.sun_irradiance.xyz, params.sky_zenith.xyz, shadow.is_to_sky);
+    return colour * params.media[0].albedo.xyz * (shadow.worth * passes);
 }
 
 // Where in its pixel a sample lies.
@@ -370,17 +351,23 @@ fn march(@builtin(global_invocation_id) id: vec3<u32>) {
     if (any(id.xy >= params.marched.xy)) {
         return;
     }
-    let pixel = pixel_of_marched(id.xy);
     let samples = max(params.counts.x, 1u);
-    var sum = vec4<f32>(0.0);
-    var depth = 0.0;
+    var progress: Progress;
+    var opacity = 0.0;
     for (var i = 0u; i < samples; i++) {
-        let ray = camera_ray(vec2<f32>(pixel) + pixel_offset(pixel, i, samples));
-        let random = hash_pixel(pixel.x, pixel.y, i + samples * params.marched.w, 2u);
-        let light = march_radiance(ray, end_of(pixel, ray), random, step_shift(id.xy, random));
-        sum += vec4<f32>(light.xyz, 1.0 - light.w);
-        depth += depth_moment;
+        progress.has_begun = false;
+        loop {
+            let pixel = pixel_of_marched(id.xy);
+            let ray = camera_ray(vec2<f32>(pixel) + pixel_offset(pixel, i, samples));
+            let random = hash_pixel(pixel.x, pixel.y, i + samples * params.marched.w, 2u);
+            let shadow = next_shadow_ray(&progress, ray, end_of(pixel, ray), random, step_shift(id.xy, random));
+            if (!shadow.is_there) {
+                break;
+            }
+            progress.scattered += light_through(shadow);
+        }
+        opacity += 1.0 - progress.transmittance;
     }
-    keep_depth(id.xy, depth / max(sum.w, MIN_F32));
-    picture[id.y * params.marched.x + id.x] = sum / f32(samples);
+    keep_depth(id.xy, progress.depth_moment / max(opacity, MIN_F32));
+    picture[id.y * params.marched.x + id.x] = vec4<f32>(progress.scattered, opacity) / f32(samples);
 }

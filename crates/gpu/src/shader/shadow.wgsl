@@ -13,7 +13,6 @@ fn sun_transmittance(p_world: vec3<f32>) -> f32 {
         return exact_transmittance(field, ray);
     }
     let step = params.march.y / length(ray.direction);
-    shadow_accessor = new_accessor();
     let lattice = Lattice(step, 0.5, params.march.z / step);
     let depth = optical_depth(field, ray, span.y - span.x, lattice, params.media[0].extinction.x, params.march_rays.z);
     return exp_(-depth);

@@ -64,15 +64,8 @@ struct Runs {
     brick: vec3<i32>,
     t: f32,
     t_end: f32,
-    box_first: vec3<i32>,
-    box_last: vec3<i32>,
     root_leaps_left: u32,
     leaps_left: u32,
-    // What was found and not yet given out: a varying run, one of a value, and a varying one, between these four
-    // distances; and how many of them are given out.
-    cuts: vec4<f32>,
-    value: f32,
-    given: u32,
 }
 
 // The position of a brick's first voxel.
@@ -90,14 +83,13 @@ fn runs_between(field: u32, ray: LocalRay, t0: f32, t1: f32) -> Runs {
     var runs: Runs;
     runs.field = field;
     runs.ray = ray;
-    runs.box_first = fields[field].box_first.xyz;
-    runs.box_last = fields[field].box_last.xyz;
-    runs.brick = clamp(brick_of_position(field, ray_at(ray, t0)), runs.box_first, runs.box_last);
+    runs.brick = clamp(
+        brick_of_position(field, ray_at(ray, t0)), fields[field].box_first.xyz, fields[field].box_last.xyz,
+    );
     runs.t = t0;
     runs.t_end = t1;
     runs.root_leaps_left = MAX_ROOT_LEAPS;
     runs.leaps_left = MAX_LEAPS;
-    runs.given = 3u;
     return runs;
 }
 
@@ -111,12 +103,14 @@ fn leap(runs: ptr<function, Runs>, first: vec3<i32>, last: vec3<i32>) {
     let is_x = faces.x <= leaves;
     let is_y = !is_x && faces.y <= leaves;
     let t = max((*runs).t, leaves);
+    let box_first = fields[(*runs).field].box_first.xyz;
+    let box_last = fields[(*runs).field].box_last.xyz;
     let within = clamp(
-        brick_of_position((*runs).field, ray_at(ray, t)), max(first, (*runs).box_first), min(last, (*runs).box_last),
+        brick_of_position((*runs).field, ray_at(ray, t)), max(first, box_first), min(last, box_last),
     );
     // The axis of the exit moves by the integers, so that the walk never stands still.
     let brick = select(within, select(first - 1, last + 1, forward), vec3<bool>(is_x, is_y, !(is_x || is_y)));
-    if (any(brick < (*runs).box_first) || any(brick > (*runs).box_last)) {
+    if (any(brick < box_first) || any(brick > box_last)) {
         (*runs).t_end = min((*runs).t_end, t);
     }
     (*runs).t = t;
@@ -135,7 +129,7 @@ fn pass_region(runs: ptr<function, Runs>, region: Region) {
         return;
     }
     let side = (1 << region.log2_bricks) - 1;
-    if (side > 0) {
+    if (side > 0 && !HAS_MAPS) {
         (*runs).leaps_left -= 1u;
         if ((*runs).leaps_left == 0u) {
             (*runs).t_end = min((*runs).t_end, (*runs).t);
@@ -214,85 +208,66 @@ fn next_segment(runs: ptr<function, Runs>, accessor: ptr<function, Accessor>) ->
     return Segment(false, 0.0, 0.0, 0.0, 0.0);
 }
 
-// Cuts the stretch of a large tile at its homogeneous part.
-fn split_tile(runs: ptr<function, Runs>, brick: vec3<i32>, region: Region, t0: f32, t1: f32) {
-    let field = (*runs).field;
-    let first = brick & vec3<i32>(-1 << region.log2_bricks);
-    let low = vec3<f32>(first - fields[field].base_brick.xyz) * BRICK_SIDE;
+// Where a ray is in the part of a large tile of which all samples have the tile's value; else it is at `t1`.
+fn core_of_tile(runs: ptr<function, Runs>, brick: vec3<i32>, region: Region, t0: f32, t1: f32) -> vec2<f32> {
+    let low = corner_of((*runs).field, brick & vec3<i32>(-1 << region.log2_bricks));
     let side = f32(1u << (region.log2_bricks + LOG2_BRICK));
     let inside = interval_in((*runs).ray, low, low + (side - 1.0));
-    var core = vec2<f32>(t1, t1);
-    if (inside.x < inside.y) {
-        core = clamp(inside, vec2<f32>(t0), vec2<f32>(t1));
-    }
-    // Only bricks are not of one value, and they are no tiles.
-    wait_with(runs, vec4<f32>(t0, core, t1), meant(field, bitcast<f32>(region.entry.payload)));
+    return select(vec2<f32>(t1), clamp(inside, vec2<f32>(t0), vec2<f32>(t1)), inside.x < inside.y);
 }
 
 // A run that may not be there.
 struct FoundRun { is_there: bool, run: Run }
 
-fn wait_with(runs: ptr<function, Runs>, cuts: vec4<f32>, value: f32) {
-    (*runs).cuts = cuts;
-    (*runs).value = value;
-    (*runs).given = 0u;
-}
-
-fn waiting_run(runs: ptr<function, Runs>) -> FoundRun {
-    let cuts = (*runs).cuts;
-    while ((*runs).given < 3u) {
-        let number = (*runs).given;
-        (*runs).given += 1u;
-        let t0 = select(select(cuts.z, cuts.y, number == 1u), cuts.x, number == 0u);
-        let t1 = select(select(cuts.w, cuts.z, number == 1u), cuts.y, number == 0u);
-        let is_varying = number != 1u;
-        if (t0 < t1 && (is_varying || (*runs).value != 0.0)) {
-            return FoundRun(true, Run(t0, t1, is_varying, select((*runs).value, 0.0, is_varying)));
-        }
-    }
-    return FoundRun(false, Run(0.0, 0.0, false, 0.0));
-}
-
-// The next run. Varying bricks that touch come as one.
+// The next run. Varying bricks that touch come as one. What ends them, and what is left of a tile, is looked up again by the next
+// call: less than to carry it along.
 fn next_run(runs: ptr<function, Runs>, accessor: ptr<function, Accessor>) -> FoundRun {
-    let waiting = waiting_run(runs);
-    if (waiting.is_there) {
-        return waiting;
-    }
-    var joined = FoundRun(false, Run(0.0, 0.0, true, 0.0));
+    var found = FoundRun(false, Run(0.0, 0.0, true, 0.0));
     while ((*runs).t < (*runs).t_end) {
         let brick = (*runs).brick;
+        let t0 = (*runs).t;
+        let t_end = (*runs).t_end;
         let region = region_at((*runs).field, accessor, brick);
         let bounds = sample_bounds((*runs).field, brick, region);
-        let t0 = (*runs).t;
         pass_region(runs, region);
         let t1 = min((*runs).t, (*runs).t_end);
         if (t0 >= t1) {
             continue;
         }
-        if (bounds.x == bounds.y) {
-            if (bounds.y == 0.0) {
-                if (region.log2_bricks == LOG2_NODE5_BRICKS && !HAS_MAPS && !IS_WIDE) {
-                    leap_to_root_entry(runs);
-                }
-                if (joined.is_there) {
-                    break;
-                }
-                continue;
-            }
-            wait_with(runs, vec4<f32>(t0, t0, t1, t1), bounds.y);
-        } else if (region.log2_bricks == 0u || IS_WIDE) {
-            joined = FoundRun(true, Run(select(t0, joined.run.t0, joined.is_there), t1, true, 0.0));
+        let is_varying = bounds.x != bounds.y;
+        if (is_varying && (region.log2_bricks == 0u || IS_WIDE)) {
+            found = FoundRun(true, Run(select(t0, found.run.t0, found.is_there), t1, true, 0.0));
             continue;
-        } else {
-            split_tile(runs, brick, region, t0, t1);
         }
-        if (joined.is_there || (*runs).given < 3u) {
+        if (found.is_there) {
+            // On from here the next time.
+            (*runs).brick = brick;
+            (*runs).t = t0;
+            (*runs).t_end = t_end;
             break;
         }
+        if (!is_varying) {
+            if (bounds.y != 0.0) {
+                return FoundRun(true, Run(t0, t1, false, bounds.y));
+            }
+            if (region.log2_bricks == LOG2_NODE5_BRICKS && !HAS_MAPS && !IS_WIDE) {
+                leap_to_root_entry(runs);
+            }
+            continue;
+        }
+        // Only bricks are not of one value, and they are no tiles: a tile varies at its ends.
+        let core = core_of_tile(runs, brick, region, t0, t1);
+        let is_core = t0 >= core.x && t0 < core.y;
+        let ends = select(select(t1, core.y, is_core), core.x, t0 < core.x);
+        if (ends < t1) {
+            (*runs).brick = brick;
+            (*runs).t = ends;
+            (*runs).t_end = t_end;
+        }
+        let value = select(0.0, meant((*runs).field, bitcast<f32>(region.entry.payload)), is_core);
+        if (!is_core || value != 0.0) {
+            return FoundRun(true, Run(t0, ends, !is_core, value));
+        }
     }
-    if (joined.is_there) {
-        return joined;
-    }
-    return waiting_run(runs);
+    return found;
 }
