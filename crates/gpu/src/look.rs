@@ -21,6 +21,8 @@ use crate::upload::Volume;
 
 /// The shortest step of [`Pass::Opacity`]: no more than seven samples then lie in a voxel, even from corner to corner.
 const SHORTEST_STEP_VOXELS: f32 = 0.25;
+/// With steps that are no shorter there are four at most.
+pub(crate) const SHORT_STEP_VOXELS: f32 = 0.5;
 
 /// How volumes are to look.
 #[derive(Debug, Clone)]

@@ -20,8 +20,8 @@ pub(crate) const TILE_TAGS: [u32; 2] = [252, 253];
 /// The furthest that is told.
 const FURTHEST: u32 = 255;
 
-/// The most cells in all: what can be counted in 31 bits without care.
-const MOST_CELLS: i64 = 1 << 28;
+/// The most cells in all: what single precision counts, and a binding of the default size holds.
+const MOST_CELLS: i64 = 1 << 24;
 /// The most cells along an axis: four million voxels, which single precision tells apart.
 const MOST_ALONG: i64 = 1 << 19;
 

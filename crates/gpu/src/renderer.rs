@@ -18,7 +18,7 @@ use nuage_render::views::View;
 use crate::device::Gpu;
 use crate::error::GpuError;
 use crate::light_volume;
-use crate::look::{Look, Medium, MediumPlace, Pass, world_from_clip};
+use crate::look::{Look, Medium, MediumPlace, Pass, SHORT_STEP_VOXELS, world_from_clip};
 use crate::params::Params;
 use crate::real_time::Stages;
 use crate::shader::{Features, Source, WORKGROUP_SIDE};
@@ -409,7 +409,8 @@ impl Renderer {
         let nothing = || GpuError::Misuse("nothing was prepared to be recorded".to_owned());
         let Prepared { key: (source, features), is_first, .. } =
             *self.prepared.as_ref().ok_or_else(nothing)?;
-        if is_first {
+        // All others write each pixel.
+        if is_first && source == Source::Path {
             encoder.clear_buffer(&self.picture, 0, None);
         }
         let real_time = self.stages.as_mut().filter(|_| features.is_real_time);
@@ -625,6 +626,7 @@ fn features(
         has_maps: volume.has_maps(),
         are_densities: volume.are_densities(),
         view: if is_lit { 0 } else { view },
+        has_short_steps: matches!(pass, Pass::Opacity { step_voxels, .. } if *step_voxels < SHORT_STEP_VOXELS),
         is_real_time: matches!(pass, Pass::RealTime { .. }),
         has_light_volume: false,
         encodes_srgb: false,

@@ -68,6 +68,8 @@ pub(crate) struct Features {
     pub(crate) are_densities: bool,
     /// What a view shows. Others have none.
     pub(crate) view: u32,
+    /// Whether a view takes more than four samples in a voxel, of which there are seven at most.
+    pub(crate) has_short_steps: bool,
     /// Whether pictures follow each other, with what `real_time.wgsl` does for them.
     pub(crate) is_real_time: bool,
     /// Whether the sun's light is read from the light volume.
@@ -97,6 +99,7 @@ impl Features {
         has_maps: false,
         are_densities: true,
         view: 0,
+        has_short_steps: false,
         is_real_time: false,
         has_light_volume: false,
         encodes_srgb: false,
@@ -122,6 +125,7 @@ impl Features {
         has_maps: true,
         are_densities: false,
         view: 0,
+        has_short_steps: true,
         is_real_time: false,
         has_light_volume: false,
         encodes_srgb: true,
@@ -286,12 +290,10 @@ impl Source {
             &Body {
                 name: "pass_voxels",
                 state: "Passing",
-                layer: Layer::Voxel,
-                enter: "(*state).number = ceil(t0 * (*state).per_step);",
-                step: "let next = ceil(t1 * (*state).per_step);
-                (*state).share *= short_power(1.0 - (*state).loss * value, next - (*state).number);
-                (*state).number = next;",
-                empty: "",
+                layer: Layer::Brick,
+                enter: "",
+                step: "pass_brick(field, values, words, ray, corner, t1, state);",
+                empty: "(*state).number = max((*state).number, ceil(t1));",
             },
         );
         let samples = hdda(
@@ -302,10 +304,9 @@ impl Source {
                 layer: Layer::Brick,
                 enter: "",
                 step: "var samples = (*state).accessor;
-                let end = ceil(t1 * (*state).per_step);
-                for (var number = ceil(t0 * (*state).per_step); number < end; number += 1.0) {
-                    let position = ray_at(ray, number * (*state).step);
-                    (*state).share *= 1.0 - (*state).loss * trilinear(field, &samples, position);
+                let end = ceil(t1);
+                for (var number = ceil(t0); number < end; number += 1.0) {
+                    (*state).share *= 1.0 - (*state).loss * trilinear(field, &samples, ray_at(ray, number));
                 }
                 (*state).accessor = samples;",
                 empty: "",
@@ -617,6 +618,7 @@ fn prelude(features: &Features) -> String {
     p.u("NODE5_TILE_TAG", maps::TILE_TAGS[1]);
     p.u("MAP_CELL_WORDS", maps::CELL_WORDS);
     p.u("VIEW", features.view);
+    p.b("HAS_SHORT_STEPS", features.has_short_steps);
     p.b("ARE_DENSITIES", features.are_densities);
     p.b("HAS_MAPS", features.has_maps);
     p.u("NODE_TAG", Entry::NODE);
@@ -624,6 +626,9 @@ fn prelude(features: &Features) -> String {
     p.u("BOUND_SIGN", bounds::SIGN);
     p.u("BOUND_EXPONENT_OFFSET", bounds::EXPONENT_OFFSET);
     p.u("BOUND_DROPPED_BITS", bounds::DROPPED_BITS);
+    // What a sample leaves of the light at least, and how far rounding moves faces, as a part of a ray's length.
+    p.f("LEAST_SHARE", 0.5 * f32::EPSILON);
+    p.f("FACE_BLUR", 4.0 * f32::EPSILON);
     p.u("BRICK_LAYER", 1u32);
     p.u("VOXEL_LAYER", 0u32);
 
@@ -664,6 +669,7 @@ fn prelude(features: &Features) -> String {
         .enumerate()
         .for_each(|(i, name)| p.b(&format!("HAS_{name}"), features.codecs >> i & 1 == 1));
     let plain = codec_bit(Codec::F32) | codec_bit(Codec::F16) | codec_bit(Codec::Uniform { bits: 3 });
+    p.b("ARE_FLOATS", features.codecs & !codec_bit(Codec::F32) == 0);
     p.b("HAS_OTHER_CODECS", features.codecs & !plain != 0);
     p.b("HAS_TEXTURES", features.textures != 0);
     p.u("BC7_MODES", tables::BC7_MODES);

@@ -48,18 +48,18 @@ fn hold_views(name: &str, renderer: &mut Renderer, volume: &GpuVolume, channel: 
     }
     let hits = picture(renderer, volume, &look, &Pass::Hits { above: 0.0 }, 0);
     let mut reader = field.reader();
-    for filter in [Filter::Nearest, Filter::Trilinear] {
+    for (filter, step_voxels) in [(Filter::Nearest, 0.5), (Filter::Nearest, 0.25), (Filter::Trilinear, 0.5)] {
         let extinction = scene.volumes[0].extinction[0];
-        let pass = Pass::Opacity { filter, step_voxels: 0.5 };
+        let pass = Pass::Opacity { filter, step_voxels };
         let ours = picture(renderer, volume, &look, &pass, 0);
         let reference: Vec<[f32; 4]> = (0..WIDTH * HEIGHT)
             .map(|i| {
                 let pixel = DVec2::new(f64::from(i % WIDTH), f64::from(i / WIDTH)) + 0.5;
                 let ray = scene.camera.ray(pixel, WIDTH, HEIGHT);
-                [1.0 - stepped_transmittance(&field, &mut reader, &ray, filter, 0.5, extinction); 4]
+                [1.0 - stepped_transmittance(&field, &mut reader, &ray, filter, step_voxels, extinction); 4]
             })
             .collect();
-        hold(&format!("{name}, steps, {filter:?}"), &ours, &reference);
+        hold(&format!("{name}, steps of {step_voxels}, {filter:?}"), &ours, &reference);
     }
     let (mut same, mut met) = (0, 0);
     for (i, hit) in (0..).zip(&hits) {

@@ -8,14 +8,14 @@ fn values_of(field: u32) -> Values {
     return Values(fields[field].origin.w, select(smallest, max(smallest, 0.0), ARE_DENSITIES), fields[field].value.xyz);
 }
 
-struct Brick { tag: u32, at: u32, line: Line }
+struct Brick { tag: u32, at: u32, is_f32: bool, line: Line }
 
 fn brick_of(values: Values, entry: Entry) -> Brick {
     var line = Line(0.0, 0.0);
     if (HAS_UNIFORM && tag_of(entry) <= LAST_UNIFORM_TAG) {
         line = line_of(brick_word(entry.payload), values.unit);
     }
-    return Brick(tag_of(entry), entry.payload, line);
+    return Brick(tag_of(entry), entry.payload, tag_of(entry) == F32_TAG, line);
 }
 
 // The value of the voxel of a number, as the field means it. Not only bricks have values, but parts of a tile too.
@@ -25,7 +25,7 @@ fn brick_value(field: u32, values: Values, brick: Brick, voxel: u32) -> f32 {
     var stored = bitcast<f32>(at);
     if (HAS_F32) {
         // Read in any case, which is less than a branch: beyond the bricks there is some word as well.
-        stored = select(stored, bitcast<f32>(brick_word(at + voxel)), brick.tag == F32_TAG);
+        stored = select(stored, bitcast<f32>(brick_word(at + voxel)), brick.is_f32);
     }
     if (HAS_F16 && brick.tag == F16_TAG) {
         stored = half_value((brick_word(at + (voxel >> 1u)) >> ((voxel & 1u) * 16u)) & 0xffffu) * values.unit;
@@ -39,6 +39,9 @@ fn brick_value(field: u32, values: Values, brick: Brick, voxel: u32) -> f32 {
         stored = line_at(brick.line, bits & ((1u << brick.tag) - 1u));
     } else if (HAS_OTHER_CODECS && brick.tag != CONSTANT_TAG && brick.tag < NODE4_TILE_TAG) {
         stored = stored_value(field, Entry(at, brick.tag), vec3<u32>(voxel >> 6u, (voxel >> 3u) & 7u, voxel & 7u));
+    }
+    if (ARE_DENSITIES && ARE_FLOATS) {
+        return stored;
     }
     if (ARE_DENSITIES) {
         return max(stored, values.smallest);

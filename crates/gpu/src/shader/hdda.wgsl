@@ -22,15 +22,16 @@ fn $NAME(field: u32, ray: LocalRay, begin: f32, end: f32, state: ptr<function, $
         if (t0 >= t1) {
             continue;
         }
+        let corner = corner_of(field, brick);
+        let words = brick_of(values, region.entry);
         $ENTER
         if ($LAYER == BRICK_LAYER || tag == CONSTANT_TAG) {
-            let cell = cells_between(ray, t0, t1, corner_of(field, brick)).packed;
+            let cell = cells_between(ray, t0, t1, corner).packed;
             let value = select(0.0, meant(field, bitcast<f32>(region.entry.payload)), tag == CONSTANT_TAG);
             $STEP
             continue;
         }
-        let words = brick_of(values, region.entry);
-        var cells = cells_between(ray, t0, t1, corner_of(field, brick));
+        var cells = cells_between(ray, t0, t1, corner);
         while (cells.t < t1) {
             let here = next_cell(&cells);
             let cell = here.packed;

@@ -6,27 +6,31 @@ fn $NAME(field: u32, ray: LocalRay, begin: f32, end: f32, state: ptr<function, $
     count_ray();
     let values = values_of(field);
     let base = fields[field].base_brick.xyz;
-    let last = vec3<f32>(fields[field].box_last.xyz - base);
+    let last_brick = fields[field].box_last.xyz - base;
     let map = u32(fields[field].box_last.w);
-    let row = vec2<u32>(u32((last.y + 2.0) * (last.z + 2.0)), u32(last.z + 2.0));
+    let row = last_brick.z + 2;
+    let layer = (last_brick.y + 2) * row;
     let is_still = ray.direction == vec3<f32>(0.0);
     let forward = ray.direction >= vec3<f32>(0.0);
     let ahead = select(vec3<f32>(-1.0), vec3<f32>(1.0), forward);
-    let face = select(vec3<f32>(0.0), vec3<f32>(1.0), forward);
+    let face = select(vec3<f32>(0.0), vec3<f32>(BRICK_SIDE), forward);
+    // Where the ray is in the planes through the first corner; in those along it, never.
+    let plane = select(-ray.origin * ray.inverse, vec3<f32>(MAX_F32), is_still);
     var t = begin;
-    var next_brick = clamp(floor(ray_at(ray, t) / BRICK_SIDE), vec3<f32>(1.0), last);
-    while (t < end) {
+    var next_brick = vec3<f32>(clamp(vec3<i32>(floor(ray_at(ray, t) / BRICK_SIDE)), vec3<i32>(1), last_brick));
+    loop {
         count_region();
         let local = next_brick;
-        let index = vec3<u32>(local);
-        let at = map + MAP_CELL_WORDS * (index.x * row.x + index.y * row.y + index.z);
+        // Converted here, since registers for numbers of one ray are dearer than those for numbers of all.
+        let last = vec3<f32>(last_brick);
+        // No map has more cells than single precision counts.
+        let at = map + MAP_CELL_WORDS * u32(local.x * f32(layer) + (local.y * f32(row) + local.z));
         let kind = tree[at];
         let is_absent = (kind & 0xffu) == ABSENT_TAG;
         // What is as empty all around.
-        let margin = select(0.0, f32(max(kind >> 8u, 1u)) - 1.0, is_absent);
-        let faces = select(
-            ((local + face + ahead * margin) * BRICK_SIDE - ray.origin) * ray.inverse, vec3<f32>(MAX_F32), is_still,
-        );
+        let margin = select(0.0, f32(kind >> 8u) - 1.0, is_absent);
+        let corner = local * BRICK_SIDE;
+        let faces = (corner + face + ahead * (margin * BRICK_SIDE)) * ray.inverse + plane;
         let leaves = min_component(faces);
         let is_x = faces.x <= leaves;
         let is_y = !is_x && faces.y <= leaves;
@@ -41,7 +45,7 @@ fn $NAME(field: u32, ray: LocalRay, begin: f32, end: f32, state: ptr<function, $
         } else {
             let brick = vec3<i32>(local) + base;
             let words = brick_of(values, Entry(tree[at + 1u], kind));
-            var cells = cells_between(ray, t0, t1, local * BRICK_SIDE);
+            var cells = cells_between(ray, t0, t1, corner);
             $ENTER
             if ($LAYER == BRICK_LAYER) {
                 let cell = cells.packed;
@@ -57,6 +61,10 @@ fn $NAME(field: u32, ray: LocalRay, begin: f32, end: f32, state: ptr<function, $
                     $STEP
                 }
             }
+        }
+        // Not at the loop's head: software goes through the body once more else, with nothing in it.
+        if (!(t < end)) {
+            break;
         }
     }
 }
