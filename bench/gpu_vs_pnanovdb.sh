@@ -23,7 +23,7 @@ command -v glslangValidator >/dev/null && command -v spirv-opt >/dev/null && com
   [ -f /usr/include/nanovdb/PNanoVDB.h ] ||
   fail "install as root: apt-get install glslang-tools spirv-tools libnanovdb-dev libnanovdb-tools mesa-vulkan-drivers"
 
-for kernel in SURFACE NEAREST_BOX NEAREST_SPANS TRILINEAR_SPANS; do
+for kernel in SURFACE NEAREST_BOX NEAREST_SPANS NEAREST_WALK TRILINEAR_SPANS; do
   glslangValidator -V --target-env vulkan1.1 "-DKERNEL=$kernel" -I/usr/include/nanovdb \
     "$root/bench/peers/pnanovdb.comp" -o "$out/$kernel.spv" >/dev/null
   spirv-opt -O "$out/$kernel.spv" -o "$out/$kernel.spv"
@@ -72,11 +72,14 @@ compare() {
     "$(ratio "$(sed -n 's/.* bytes=\([0-9]*\).*/\1/p' <<<"$line")" "$(field peer_bytes "$line")")" "$(field psnr "$line")"
   [ "$kernel" != surface ] ||
     echo "  depths within 0.1 voxel: $(field within "$line") of $(field both "$line"); met by one side alone: $(field one_sided "$line")"
+  [ "$kernel $form" != "surface f32" ] ||
+    echo "  of the others a walk in double precision agrees with ours in $(field right "$line"), with the peer's in $(field peer_right "$line")"
 }
 
 for form in f32 u8 u4; do
   compare "$form" nearest NEAREST_SPANS "${files[0]}"
 done
+compare f32 nearest NEAREST_WALK "${files[0]}"
 compare f32 nearest NEAREST_BOX "${files[0]}"
 for form in ${TRILINEAR-f32 u8}; do
   compare "$form" trilinear TRILINEAR_SPANS "${files[0]}"
@@ -101,7 +104,7 @@ radv=/usr/share/vulkan/icd.d/radeon_icd.x86_64.json
 [ -f "$radv" ] || exit 0
 for family in ${FAMILIES-NAVI21 GFX1100}; do
   shaders=()
-  for kernel in SURFACE NEAREST_SPANS TRILINEAR_SPANS; do
+  for kernel in SURFACE NEAREST_SPANS NEAREST_WALK TRILINEAR_SPANS; do
     [ ! -f "$out/nuage_${kernel}_f32.wgsl" ] || shaders+=("$out/nuage_${kernel}_f32.wgsl" "$out/$kernel.spv")
   done
   shaders+=("$out/nuage_MARCH_f32.wgsl" "$out/nuage_MARCH_u8.wgsl")

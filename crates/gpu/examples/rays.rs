@@ -27,11 +27,17 @@ use nuage_render::light::{Light, Sky, Sun};
 use nuage_render::march::Quality;
 use nuage_render::scene::Phase;
 use nuage_testkit::clock::processor_ms;
+use nuage_volume::accessor::Accessor;
+use nuage_volume::channel::Channel;
 use nuage_volume::format::Asset;
 
 /// Per voxel at density 1.
 const EXTINCTION_PER_VOXEL: f64 = 0.1;
 const STEP_VOXELS: f32 = 0.5;
+/// Depths that differ by more are settled by a third walk.
+const DEPTH_TOLERANCE_VOXELS: f64 = 0.1;
+/// How far single precision moves a ray some hundreds of voxels away.
+const ROUNDING_VOXELS: f64 = 1e-4;
 
 type Failure = Box<dyn Error>;
 
@@ -43,6 +49,8 @@ struct Ours {
     active: [IVec3; 2],
     /// The value at the surface.
     level: f32,
+    /// What was uploaded, of a .vdb file.
+    channel: Option<Channel>,
 }
 
 fn of_vdb(gpu: &Gpu, bytes: &[u8], is_surface: bool) -> Result<Ours, Failure> {
@@ -57,6 +65,7 @@ fn of_vdb(gpu: &Gpu, bytes: &[u8], is_surface: bool) -> Result<Ours, Failure> {
         world_from_index: channel.world_from_index,
         active: [active.min, active.max],
         level,
+        channel: Some(channel),
     })
 }
 
@@ -76,7 +85,34 @@ fn of_nuage(gpu: &Gpu, bytes: Vec<u8>, is_surface: bool) -> Result<Ours, Failure
         world_from_index: DAffine3::from_cols_array(&columns),
         active: [IVec3::from_array(min), IVec3::from_array(max)],
         level: band,
+        channel: None,
     })
+}
+
+/// Where a ray in index space, in which voxels begin at their place, enters the first voxel of a value above a level: in double
+/// precision, through each voxel of the box.
+fn first_entered(
+    channel: &Channel,
+    [low, high]: [DVec3; 2],
+    origin: DVec3,
+    direction: DVec3,
+    level: f32,
+) -> f64 {
+    let (a, b) = ((low - origin) / direction, (high + 1.0 - origin) / direction);
+    let (mut t, end) = (a.min(b).max_element(), a.max(b).min_element());
+    let mut voxel = (origin + direction * t).floor().clamp(low, high);
+    let mut accessor = Accessor::new(&channel.tree);
+    while t < end {
+        if accessor.voxel(voxel.as_ivec3()) > level {
+            return t;
+        }
+        let faces = (voxel + DVec3::select(direction.cmpge(DVec3::ZERO), DVec3::ONE, DVec3::ZERO) - origin)
+            / direction;
+        t = faces.min_element();
+        let axis = faces.to_array().iter().position(|face| *face == t).unwrap_or(0);
+        voxel[axis] += direction[axis].signum();
+    }
+    -1.0
 }
 
 /// The peer's kernel, ready to run.
@@ -327,15 +363,33 @@ fn main() -> Result<(), Failure> {
     let our_values = renderer.pixels()?;
     let to_voxels = if is_surface { (1.0 / voxel_size) as f32 } else { 1.0 };
     let (mut squares, mut peak, mut largest, mut within, mut both) = (0.0_f64, 0.0_f64, 0.0_f64, 0, 0);
-    let mut one_sided = 0;
-    for ([value, ..], expected) in our_values.iter().zip(&peer_values) {
+    let (mut one_sided, mut right, mut peer_right) = (0, 0, 0);
+    for (i, ([value, ..], expected)) in our_values.iter().zip(&peer_values).enumerate() {
         if is_surface && (*value < 0.0 || *expected < 0.0) {
             one_sided += u32::from((*value < 0.0) != (*expected < 0.0));
             continue;
         }
         let difference = f64::from((value * to_voxels - expected).abs());
         both += 1;
-        within += u32::from(difference <= 0.1);
+        within += u32::from(difference <= DEPTH_TOLERANCE_VOXELS);
+        if let Some(channel) =
+            ours.channel.as_ref().filter(|_| is_surface && difference > DEPTH_TOLERANCE_VOXELS)
+        {
+            let [column, row] = [i % size as usize, i / size as usize];
+            let [x, y] = [column, row].map(|at| 2.0 * (at as f64 + 0.5) / f64::from(size) - 1.0);
+            let tangent = camera.half_width_tangent;
+            let direction = DVec3::new(x * tangent, -y * tangent, -1.0).normalize();
+            // Rays through an edge of voxels enter the one or the other by rounding.
+            let truths = [(0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)].map(|(x, y)| {
+                let origin = eye + ROUNDING_VOXELS * DVec3::new(x, y, 0.0);
+                first_entered(channel, [low, high], origin, direction, ours.level)
+            });
+            let is_near =
+                |depth: f32, truth: &f64| (f64::from(depth) - truth).abs() <= DEPTH_TOLERANCE_VOXELS;
+            let is_right = |depth: f32| u32::from(truths.iter().any(|truth| is_near(depth, truth)));
+            right += is_right(value * to_voxels);
+            peer_right += is_right(*expected);
+        }
         squares += difference * difference;
         largest = largest.max(difference);
         peak = peak.max(f64::from(expected.abs()));
@@ -346,7 +400,7 @@ fn main() -> Result<(), Failure> {
     let ([wall, cpu], [peer_wall, peer_cpu]) = (our_times.medians(), peer_times.medians());
     println!(
         "wall_ms={wall:.1} cpu_ms={cpu:.1} peer_wall_ms={peer_wall:.1} peer_cpu_ms={peer_cpu:.1} bytes={our_bytes} \
-         peer_bytes={} psnr={psnr:.1} largest={largest:.4} within={within} both={both} one_sided={one_sided}",
+         peer_bytes={} psnr={psnr:.1} largest={largest:.4} within={within} both={both} one_sided={one_sided} right={right} peer_right={peer_right}",
         peer.bytes
     );
     Ok(())
