@@ -49,11 +49,12 @@ fn rank(mask: u32, summary_words: u32, slot: u32) -> u32 {
     return half_word(first_kept + kept_count, kept) + bits_below(bits, bit);
 }
 
-// A reader that remembers its path: nodes by the coordinates they were found at.
-struct Accessor { key5: vec3<i32>, node5: u32, key4: vec3<i32>, node4: u32 }
+// A reader that remembers the last node of bricks, by the coordinates it was found at. What is above is looked up again: that is
+// seldom, and its path would take registers.
+struct Accessor { key4: vec3<i32>, node4: u32 }
 
 fn new_accessor() -> Accessor {
-    return Accessor(vec3<i32>(0), NONE, vec3<i32>(0), NONE);
+    return Accessor(vec3<i32>(0), NONE);
 }
 
 fn is_before(a: vec3<i32>, b: vec3<i32>) -> bool {
@@ -130,16 +131,11 @@ fn region_at(field: u32, accessor: ptr<function, Accessor>, brick: vec3<i32>) ->
     }
     let key4 = brick >> vec3<u32>(LOG2_NODE4_BRICKS);
     if ((*accessor).node4 == NONE || any((*accessor).key4 != key4)) {
-        let key5 = brick >> vec3<u32>(LOG2_NODE5_BRICKS);
-        if ((*accessor).node5 == NONE || any((*accessor).key5 != key5)) {
-            let root = root_entry(field, key5);
-            if (tag_of(root) != NODE_TAG) {
-                return Region(LOG2_NODE5_BRICKS, 0, root);
-            }
-            (*accessor).key5 = key5;
-            (*accessor).node5 = root.payload;
+        let root = root_entry(field, brick >> vec3<u32>(LOG2_NODE5_BRICKS));
+        if (tag_of(root) != NODE_TAG) {
+            return Region(LOG2_NODE5_BRICKS, 0, root);
         }
-        let entry = node_entry(NODE5S, (*accessor).node5, NODE5_SUMMARY_WORDS, node5_slot(brick));
+        let entry = node_entry(NODE5S, root.payload, NODE5_SUMMARY_WORDS, node5_slot(brick));
         if (tag_of(entry) != NODE_TAG) {
             return Region(LOG2_NODE4_BRICKS, 0, entry);
         }
