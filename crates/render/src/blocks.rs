@@ -9,6 +9,7 @@
 
 use std::sync::{Arc, OnceLock};
 
+use crate::gather::prefetch;
 use glam::{IVec3, Vec3};
 use nuage_volume::accessor::{Accessor, BrickPlace};
 use nuage_volume::space::brick_of;
@@ -103,6 +104,14 @@ impl<'a> Blocks<'a> {
     #[inline(always)]
     pub(crate) fn known(&self, entry: usize) -> Option<&Block> {
         self.store.blocks.get(entry)?.get().map(AsRef::as_ref)
+    }
+
+    /// Asks for what says where the block of an entry is.
+    #[inline(always)]
+    pub(crate) fn ask_for_place(&self, entry: usize) {
+        if let Some(slot) = self.store.blocks.get(entry) {
+            prefetch(std::slice::from_ref(slot));
+        }
     }
 
     /// The block of a brick that has no entry of its own, being part of a tile.

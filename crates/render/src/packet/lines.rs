@@ -3,8 +3,8 @@
 use fearless_simd::{Level, Simd, dispatch, f32x16, i32x16, mask32x16, prelude::*};
 use nuage_volume::brick::Bricks;
 
-use super::ahead::{Asked, EACH_VOXELS, ahead_of, ask_for_block, ask_for_brick};
-use super::{Lanes, Packet, RAYS, Stretch, bricks_of, each_ray, interpolate, to_int};
+use super::late::{Asked, Late, ask_for_brick};
+use super::{Lanes, Packet, RAYS, Stretch, each_ray, interpolate, to_int};
 use crate::blocks::Blocks;
 use crate::camera::Ray;
 use crate::depth::{self, NEAREST_SHIFT, Stored};
@@ -113,34 +113,59 @@ pub(super) fn values_of<S: Simd, V: Stored>(
     cells: i32x16<S>,
     voxels: [i32x16<S>; 3],
 ) -> f32x16<S> {
-    let simd = lanes.simd;
-    let found = V::gather(simd, values, places_of(simd, cells, voxels));
-    lanes.with_specials(cells, found)
+    values_at(lanes, values, places_of(lanes.simd, cells, voxels))
 }
 
-/// The places of voxels in the values of all bricks; beyond all where cells hold no brick.
+/// How many turns pass between asking for values and using them, by what a turn is: a voxel or a cell.
+const VOXEL_TURNS: usize = 32;
+const CELL_TURNS: usize = 16;
+
+/// The place beyond all values, whose value is 0. Below it stand the constants of special cells.
+const NO_PLACE: i32 = -1;
+
+/// The places of voxels in the values of all bricks, or of the constants of special cells.
 #[inline(always)]
 fn places_of<S: Simd>(simd: S, cells: i32x16<S>, voxels: [i32x16<S>; 3]) -> i32x16<S> {
     let offsets = ((voxels[0] & 7) << 6) | ((voxels[1] & 7) << 3) | (voxels[2] & 7);
-    let holds_brick = cells.simd_ge(0) & cells.simd_lt(SPECIAL);
-    holds_brick.select((cells << 9) | offsets, i32x16::splat(simd, -1))
+    let of_brick = (cells << 9) | offsets;
+    let is_special = cells.simd_ge(SPECIAL);
+    let others =
+        is_special.select(i32x16::splat(simd, NO_PLACE - 1 + SPECIAL) - cells, i32x16::splat(simd, NO_PLACE));
+    (cells.simd_ge(0) & !is_special).select(of_brick, others)
+}
+
+/// The values at places.
+#[inline(always)]
+fn values_at<S: Simd, V: Stored>(lanes: &Lanes<'_, S>, values: &[V], places: i32x16<S>) -> f32x16<S> {
+    let found = V::gather(lanes.simd, values, places);
+    let is_special = places.simd_lt(NO_PLACE);
+    match is_special.any_true() {
+        true => is_special.select(lanes.constants(i32x16::splat(lanes.simd, NO_PLACE - 1) - places), found),
+        false => found,
+    }
 }
 
 #[inline(always)]
 fn integrate_voxels<S: Simd, V: Stored>(lanes: &Lanes<'_, S>, values: &[V]) -> [f32; RAYS] {
-    let (none, mut depth) = (mask32x16::splat(lanes.simd, false), lanes.splat(0.0));
-    let ahead = ahead_of(lanes);
-    let mut asked = Asked::new(EACH_VOXELS);
+    let (simd, none) = (lanes.simd, mask32x16::splat(lanes.simd, false));
+    let (zero, mut depth) = (lanes.splat(0.0), lanes.splat(0.0));
+    let mut asked = Asked::<_, 1>::new(simd);
+    let mut late = Late::<_, VOXEL_TURNS>::new((i32x16::splat(simd, NO_PLACE), zero));
     lanes.each_stretch(
         #[inline(always)]
         |stretch| {
-            asked.look_ahead(lanes, stretch.t + ahead, |brick| ask_for_brick(values, brick));
+            asked.enter(simd, stretch.cells, |brick, _| ask_for_brick(values, brick));
             // Those that have left stand in an empty cell.
-            depth +=
-                values_of(lanes, values, stretch.cells, to_int(stretch.voxels)) * (stretch.end - stretch.t);
+            let places = places_of(simd, stretch.cells, to_int(stretch.voxels));
+            if let Some((places, length)) = late.keep((places, stretch.end - stretch.t)) {
+                depth += values_at(lanes, values, places) * length;
+            }
             none
         },
     );
+    for (places, length) in late.rest() {
+        depth += values_at(lanes, values, places) * length;
+    }
     depth.to_array()
 }
 
@@ -150,12 +175,11 @@ fn integrate_cells<'a, S: Simd>(
     field: &Field<'a>,
     blocks: &mut Blocks<'a>,
 ) -> [f32; RAYS] {
-    let (none, mut depth) = (mask32x16::splat(lanes.simd, false), lanes.splat(0.0));
-    let (ahead, mut asked) = (ahead_of(lanes), Asked::new(EACH_VOXELS));
-    lanes.each_stretch(
+    let mut depth = lanes.splat(0.0);
+    lanes.each_stretch_late::<CELL_TURNS>(
+        blocks,
         #[inline(always)]
-        |stretch| {
-            asked.look_ahead(lanes, stretch.t + ahead, |entry| ask_for_block(blocks, entry));
+        |blocks, stretch| {
             if stretch.is_filled().any_true() {
                 let Stretch { t, end, voxels, cells, .. } = *stretch;
                 let length = end - t;
@@ -166,7 +190,6 @@ fn integrate_cells<'a, S: Simd>(
                 let mean = depth::mean_in_cell!(corners, [x, y, z], [dx, dy, dz]);
                 depth += lanes.with_specials(cells, mean) * length;
             }
-            none
         },
     );
     depth.to_array()
@@ -183,13 +206,11 @@ fn sample_cells<'a, S: Simd>(
 ) -> [f32; RAYS] {
     let (zero, one) = (lanes.splat(0.0), lanes.splat(1.0));
     let (per_step, loss) = (one / steps, steps * extinction);
-    let none = mask32x16::splat(lanes.simd, false);
     let (mut number, mut passes) = (zero, one);
-    let (ahead, mut asked) = (ahead_of(lanes), Asked::new(EACH_VOXELS));
-    lanes.each_stretch(
+    lanes.each_stretch_late::<CELL_TURNS>(
+        blocks,
         #[inline(always)]
-        |stretch| {
-            asked.look_ahead(lanes, stretch.t + ahead, |entry| ask_for_block(blocks, entry));
+        |blocks, stretch| {
             let Stretch { end, voxels, cells, .. } = *stretch;
             let mut t_sample = number * steps;
             let mut inside = stretch.is_filled() & t_sample.simd_lt(end);
@@ -210,13 +231,12 @@ fn sample_cells<'a, S: Simd>(
             if is_empty.any_true() {
                 number = is_empty.select((end * per_step).ceil().max(number), number);
             }
-            none
         },
     );
     passes.to_array()
 }
 
-/// Goes from sample to sample.
+/// Goes from voxel to voxel: all samples in one find the same value.
 #[inline(always)]
 fn sample_voxels<S: Simd, V: Stored>(
     lanes: &Lanes<'_, S>,
@@ -224,29 +244,49 @@ fn sample_voxels<S: Simd, V: Stored>(
     steps: f32x16<S>,
     extinction: f32,
 ) -> [f32; RAYS] {
-    let (one, per_step, loss) = (lanes.splat(1.0), lanes.splat(1.0) / steps, steps * extinction);
-    let (mut number, mut passes, mut asked) = (lanes.splat(0.0), one, Asked::new(2 * EACH_VOXELS));
-    let ahead = ahead_of(lanes);
-    loop {
-        let t = number * steps;
-        let active = t.simd_lt(lanes.ends);
-        if !active.any_true() {
-            break;
-        }
-        let position = lanes.at(t);
-        let bricks = bricks_of(position);
-        let cells = lanes.cells(bricks, active);
-        let is_empty = cells.simd_lt(0);
-        number += one;
-        if !is_empty.all_true() {
-            asked.look_ahead(lanes, t + ahead, |brick| ask_for_brick(values, brick));
-            passes *= one - values_of(lanes, values, cells, to_int(position)) * loss;
-        }
-        if (is_empty & active).any_true() {
-            let leaving = lanes.leave_bricks(bricks, lanes.beyond(cells), t);
-            let next = (leaving * per_step).ceil().max(number);
-            number = is_empty.select(next, number);
-        }
+    let (simd, none) = (lanes.simd, mask32x16::splat(lanes.simd, false));
+    let (zero, one) = (lanes.splat(0.0), lanes.splat(1.0));
+    let (per_step, loss) = (one / steps, steps * extinction);
+    let (mut number, mut passes) = (zero, one);
+    let mut asked = Asked::<_, 1>::new(simd);
+    let mut late = Late::<_, VOXEL_TURNS>::new((i32x16::splat(simd, NO_PLACE), zero));
+    lanes.each_stretch(
+        #[inline(always)]
+        |stretch| {
+            asked.enter(simd, stretch.cells, |brick, _| ask_for_brick(values, brick));
+            let places = places_of(simd, stretch.cells, to_int(stretch.voxels));
+            let next = (stretch.end * per_step).ceil().max(number);
+            let samples = next - number;
+            number = next;
+            if let Some((places, samples)) = late.keep((places, samples)) {
+                passes *= power(one - values_at(lanes, values, places) * loss, samples);
+            }
+            none
+        },
+    );
+    for (places, samples) in late.rest() {
+        passes *= power(one - values_at(lanes, values, places) * loss, samples);
     }
     passes.to_array()
+}
+
+/// Powers whose exponents are whole numbers, mostly small ones.
+#[inline(always)]
+fn power<S: Simd>(base: f32x16<S>, exponent: f32x16<S>) -> f32x16<S> {
+    let simd = base.simd;
+    let (one, even) = (f32x16::splat(simd, 1.0), i32x16::splat(simd, 0));
+    let (mut left, mut square) = (exponent.to_int::<i32x16<S>>(), base);
+    let mut product = one;
+    // Not a loop up to the largest exponent: how often it turns could not be told before.
+    for _ in 0..3 {
+        product *= (left & 1).simd_eq(even).select(one, square);
+        square *= square;
+        left >>= 1;
+    }
+    while left.simd_gt(even).any_true() {
+        product *= (left & 1).simd_eq(even).select(one, square);
+        square *= square;
+        left >>= 1;
+    }
+    product
 }
