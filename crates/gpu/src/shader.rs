@@ -278,7 +278,9 @@ impl Source {
                 state: "VoxelHit",
                 layer: Layer::Voxel,
                 enter: "",
-                step: "if (value > (*state).above && t0 < t1) {
+                // By rounding a ray may begin beside the active voxels, where anything is stored.
+                step: "if (value > (*state).above && t0 < t1
+                    && is_active(field, (brick << vec3<u32>(LOG2_BRICK)) + local_of(cell))) {
                 *state = VoxelHit(true, (*state).above, t0, brick, cell, value);
                 return;
             }",
@@ -685,9 +687,8 @@ fn prelude(features: &Features) -> String {
     p.u("MAX_ROOT_LEAPS", traverse::MAX_ROOT_LEAPS);
     p.i("MAX_ROOT_LEAP", traverse::MAX_ROOT_LEAP as i32);
     p.u("MOST_REFINEMENTS", surface::MOST_REFINEMENTS);
-    // Gauss' rule of two points, and a part of a brick that tells which side of a face a ray goes to.
+    // Gauss' rule of two points.
     p.f("GAUSS_NODE", 1.0 / 3.0_f32.sqrt());
-    p.f("GAUSS_NUDGE", 1e-5);
     p.f("LIT_PIECE_DEPTH", march::LIT_PIECE_DEPTH);
     p.f("LIT_PIECE_VOXELS", march::LIT_PIECE_VOXELS);
     p.f("MOST_PIECES", march::MOST_PIECES);
