@@ -21,7 +21,7 @@ use crate::light_volume;
 use crate::look::{Look, Medium, MediumPlace, Pass, SHORT_STEP_VOXELS, world_from_clip};
 use crate::params::Params;
 use crate::real_time::Stages;
-use crate::shader::{Features, Source, WORKGROUP_SIDE};
+use crate::shader::{Features, Source, UNSOUND, WORKGROUP_SIDE};
 use crate::sky::{sky_group, sky_layout};
 use crate::upload::{Volume, bind, buffer_entry, storage_entry};
 
@@ -579,10 +579,16 @@ impl Renderer {
     /// The picture, row by row: colour times opacity, and opacity; of paths their mean.
     ///
     /// # Errors
-    /// If the device fails.
+    /// If the device fails. Lavapipe, which leaves loops after some 65,000 turns in all, is found out where a picture asks for
+    /// more; of pictures that follow each other it is not.
     pub fn pixels(&self) -> Result<Vec<[f32; 4]>, GpuError> {
         let bytes = self.gpu.read(&self.picture)?;
         let floats: Vec<[f32; 4]> = bytemuck::pod_collect_to_vec(&bytes);
+        if floats.iter().any(|pixel| pixel[3] <= UNSOUND) {
+            let what =
+                "its driver leaves loops that take long; take longer steps, fewer rays or a simpler filter";
+            return Err(GpuError::Device(what.to_owned()));
+        }
         let share = self.current.tone[1];
         Ok(floats.into_iter().map(|pixel| pixel.map(|value| value * share)).collect())
     }

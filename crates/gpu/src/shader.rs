@@ -30,6 +30,10 @@ pub(crate) const WORKGROUP_SIDE: u32 = 8;
 /// would keep a device busy until its driver takes it for lost.
 const MAX_DRAWS: u32 = 1 << 20;
 const MAX_LEAPS: u32 = 1 << 16;
+/// The opacity of a pixel that cannot be known, since the driver left loops before their end.
+pub(crate) const UNSOUND: f32 = f32::MIN;
+/// The turns of the loop that tells, which a loop that is left after one does not take.
+pub(crate) const TELLING_TURNS: u32 = 2;
 /// The words in front of the arrays of trees that say where each begins.
 pub(crate) const HEADER_WORDS: usize = 8;
 
@@ -732,6 +736,9 @@ fn prelude(features: &Features) -> String {
     p.f("UPSAMPLE_TOLERANCE", real_time::UPSAMPLE_TOLERANCE);
     p.f("KEPT_TOLERANCE", real_time::KEPT_TOLERANCE);
     p.b("ENCODES_SRGB", features.encodes_srgb);
+    // What is accumulated would not forget.
+    p.b("CHECKS_LOOPS", !features.is_real_time && !features.counts);
+    p.f("UNSOUND", UNSOUND);
     for (i, name) in [
         "VIEW_DENSITY",
         "VIEW_DEPTH",
