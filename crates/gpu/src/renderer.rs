@@ -167,7 +167,8 @@ impl Renderer {
     /// What the rays of a picture look up: runs the pass once more, with shaders that count. The picture is gone then.
     ///
     /// # Errors
-    /// As [`Renderer::prepare`] and [`Renderer::run`].
+    /// As [`Renderer::prepare`] and [`Renderer::run`], and for pictures that follow each other: of theirs, what is looked up
+    /// hangs on those before.
     pub fn count(
         &mut self,
         volume: &Volume,
@@ -176,6 +177,9 @@ impl Renderer {
         frame: usize,
     ) -> Result<Counts, GpuError> {
         check_frame(volume, frame)?;
+        if matches!(pass, Pass::RealTime { .. }) {
+            return Err(GpuError::Misuse("pictures that follow each other are not counted".to_owned()));
+        }
         self.prepare_shader(volume, look, pass, frame, None, source_of(pass), true)?;
         self.run(volume)?;
         let counted: Vec<[f32; 4]> = bytemuck::pod_collect_to_vec(&self.gpu.read(&self.picture)?);
