@@ -203,7 +203,8 @@ impl Arrays {
     /// that a frame lacks is empty there.
     ///
     /// # Errors
-    /// If there are no such frames, pages are not loaded, bricks are damaged, or a transform is not linear.
+    /// If there are no such frames, pages are not loaded, bricks are damaged, a transform is not linear, or a background is not
+    /// empty: channels of such grids can be taken by [`Arrays::of_channels`].
     pub fn of_asset(
         asset: &Asset,
         wanted: &[Wanted],
@@ -351,6 +352,11 @@ impl Arrays {
         gathered: &mut Gathered,
     ) -> Result<Option<Place>, GpuError> {
         let (Some([min, max]), Some(tree)) = (grid.active_box, grid.levels.first()) else { return Ok(None) };
+        // Where nothing stands, shaders take it that nothing is.
+        let [scale, bias, most] = meaning.line();
+        if (bias + scale * tree.background).clamp(0.0, most) > 0.0 {
+            return Err(GpuError::Unsupported { feature: "a packed grid that is not empty where it has no voxels" });
+        }
         let columns = grid
             .world_from_index
             .ok_or(GpuError::Unsupported { feature: "a transform that is not linear" })?;
