@@ -355,7 +355,9 @@ impl Arrays {
         // Where nothing stands, shaders take it that nothing is.
         let [scale, bias, most] = meaning.line();
         if (bias + scale * tree.background).clamp(0.0, most) > 0.0 {
-            return Err(GpuError::Unsupported { feature: "a packed grid that is not empty where it has no voxels" });
+            return Err(GpuError::Unsupported {
+                feature: "a packed grid that is not empty where it has no voxels",
+            });
         }
         let columns = grid
             .world_from_index

@@ -470,6 +470,9 @@ impl Renderer {
             pass.dispatch_workgroups(x, y, 1);
         }
         if let Some(stages) = self.stages.as_mut().filter(|_| features.is_real_time) {
+            if sources.contains(&Source::LightVolume) {
+                stages.await_fill(encoder);
+            }
             stages.send_times_back(encoder);
         }
         Ok(())
@@ -725,6 +728,31 @@ mod tests {
         assert!(fills(&volume, &look, quality, 0, false), "a volume that was filled anew");
         let other = Volume::new(&gpu, &arrays).expect("a volume");
         assert!(fills(&other, &look, quality, 0, false), "another volume");
+    }
+
+    /// An encoder that is dropped fills no light volume: the next one does.
+    #[test]
+    fn light_volumes_are_filled_though_an_encoder_is_dropped() {
+        let Some(gpu) = crate::twins::gpu() else { return };
+        let channel = crate::hostile::block(2);
+        let volume = Volume::new(&gpu, &Arrays::of_channels(&[&channel]).expect("arrays")).expect("a volume");
+        let look = crate::hostile::look();
+        let measures = RealTime { accumulate: false, ..RealTime::default() };
+        let pass = Pass::RealTime { quality: Quality { sky_rays: 0, ..Quality::default() }, measures };
+        let mut shown = |dropped: usize| {
+            let mut renderer = Renderer::new(&gpu, [32, 18]).expect("a renderer");
+            renderer.prepare(&volume, &look, &pass, 0, None).expect("a pass");
+            for _ in 0..dropped {
+                let mut encoder =
+                    gpu.device().create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
+                renderer.record(&mut encoder, &volume).expect("a record");
+            }
+            renderer.run(&volume).expect("a run");
+            renderer.pixels().expect("pixels")
+        };
+        let expected = shown(0);
+        assert!(expected.iter().any(|pixel| pixel[0] > 0.0), "the sun is seen");
+        assert_eq!(shown(1), expected);
     }
 
     #[test]
