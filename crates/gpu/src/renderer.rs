@@ -739,7 +739,7 @@ mod tests {
         let look = crate::hostile::look();
         let measures = RealTime { accumulate: false, ..RealTime::default() };
         let pass = Pass::RealTime { quality: Quality { sky_rays: 0, ..Quality::default() }, measures };
-        let mut shown = |dropped: usize| {
+        let shown = |dropped: usize| {
             let mut renderer = Renderer::new(&gpu, [32, 18]).expect("a renderer");
             renderer.prepare(&volume, &look, &pass, 0, None).expect("a pass");
             for _ in 0..dropped {

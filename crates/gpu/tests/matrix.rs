@@ -7,10 +7,7 @@ mod common;
 use common::gpu;
 use std::time::Instant;
 
-use common::matrix::{
-    ALL_PARTS, Beside, Form, Matrix, Pair, Part, SMALL, Subject, forms, hold, pairs, subjects,
-};
-use nuage_gpu::arrays::Bricks;
+use common::matrix::{ALL_PARTS, Form, Matrix, Pair, Part, SMALL, Subject, forms, hold, pairs, subjects};
 use nuage_gpu::device::Gpu;
 use nuage_gpu::renderer::Renderer;
 use nuage_render::filter::{Filter, Lookup};
@@ -140,7 +137,6 @@ struct Bench {
     renderer: Renderer,
     matrix: Matrix,
     forms: Vec<Form>,
-    pairs: Vec<Pair>,
 }
 
 impl Bench {
@@ -148,26 +144,18 @@ impl Bench {
         let gpu = gpu()?;
         let renderer = Renderer::new(&gpu, SMALL).expect("a renderer");
         let forms = forms(gpu.smallest_bricks().expect("a form"));
-        Some(Bench { gpu, renderer, matrix: Matrix::default(), forms, pairs: Vec::new() })
+        Some(Bench { gpu, renderer, matrix: Matrix::default(), forms })
     }
 
-    fn add(&mut self, subject: &Subject, form: usize, beside: Beside) {
-        let form = &self.forms[form];
-        // A channel holds floats alone, and shapes are found among all bricks.
-        let is_alone =
-            form.options.is_none() || form.bricks == Bricks::Decoded || form.name.contains("shapes");
-        let beside = if is_alone { Beside::Nothing } else { beside };
-        self.pairs.extend(pairs(&self.gpu, subject, form, beside));
-    }
-
-    /// Holds what was added. Part after part: lavapipe forgets shaders so large when it makes others.
-    fn hold(&mut self, parts: &[Part]) {
+    /// Holds volumes in a form. Part after part: lavapipe takes seconds to make a shader, and forgets large ones.
+    fn hold(&mut self, form: usize, subjects: &[&Subject], parts: &[Part]) {
+        let pairs: Vec<Pair> =
+            subjects.iter().flat_map(|subject| pairs(&self.gpu, subject, &self.forms[form])).collect();
         for part in parts {
-            for pair in &self.pairs {
+            for pair in &pairs {
                 hold(&mut self.matrix, &mut self.renderer, pair, *part);
             }
         }
-        self.pairs.clear();
     }
 
     fn named(&self, names: &[&str]) -> Vec<usize> {
@@ -175,64 +163,53 @@ impl Bench {
     }
 }
 
-/// All forms that differ of all volumes that do, by all filters; of other volumes and forms some in turn. Prints what it found.
+/// All forms of the volumes that differ, by all filters: those that share a decoder with another of each third volume in turn,
+/// and large volumes and those that are like others in a form each, in turn. Prints what it found.
 #[test]
 #[ignore = "takes an hour"]
 fn the_whole_matrix_is_that_of_the_cpu() {
     let Some(mut bench) = Bench::new() else { return };
-    let unlike = bench.named(&UNLIKE_FORMS);
-    let all: Vec<usize> = (0..bench.forms.len()).collect();
     let start = Instant::now();
-    let mut turn = 0;
-    let whole = SMALL_FILES.iter().chain(&WIDE_FILES).chain(&LARGE_FILES[..6]).map(|file| (file, true));
-    let in_turn = LIKE_FILES.iter().chain(&LARGE_FILES[6..]).map(|file| (file, false));
-    for (file, is_whole) in whole.chain(in_turn) {
-        for subject in subjects(file) {
-            let chosen: Vec<usize> = match is_whole {
-                _ if turn == 0 => all.clone(),
-                true => unlike.clone(),
-                false => (0..3).map(|i| (7 * turn + 21 * i) % all.len()).collect(),
-            };
-            for form in chosen {
-                bench.add(&subject, form, Beside::Tree);
-                if subject.is_small() {
-                    bench.add(&subject, form, Beside::Map);
-                }
-                // Shaders of its own for each form.
-                if turn == 0 && unlike.contains(&form) {
-                    bench.add(&subject, form, Beside::Nothing);
-                }
-            }
-            turn += 1;
-        }
-        bench.hold(&ALL_PARTS);
-        println!("{file}: {:.0} s", start.elapsed().as_secs_f32());
+    let load = |files: &[&str]| -> Vec<Subject> { files.iter().flat_map(|file| subjects(file)).collect() };
+    let whole = load(&[&SMALL_FILES[..], &WIDE_FILES[..]].concat());
+    let in_turn = load(&[&LIKE_FILES[..], &LARGE_FILES[..]].concat());
+    let unlike = bench.named(&UNLIKE_FORMS);
+    for form in 0..bench.forms.len() {
+        let step = if unlike.contains(&form) { 1 } else { 3 };
+        let own = whole.iter().skip(form % step).step_by(step);
+        let others = in_turn.iter().skip(form).step_by(bench.forms.len());
+        let wrapped = in_turn.iter().enumerate().filter(|(i, _)| unlike.get(i % unlike.len()) == Some(&form));
+        let chosen: Vec<&Subject> = own.chain(others).chain(wrapped.map(|(_, subject)| subject)).collect();
+        bench.hold(form, &chosen, &ALL_PARTS);
+        println!(
+            "{}: {} volumes, {:.0} s",
+            bench.forms[form].name,
+            chosen.len(),
+            start.elapsed().as_secs_f32()
+        );
+        bench.matrix.print(&bench.forms[form].name);
     }
-    bench.matrix.print();
     bench.matrix.check();
 }
 
-/// One volume in all forms that differ, each other small or wide one in one of a few, and those of halves by more filters: by
-/// what is made soonest.
+/// One volume in all forms that differ, each other small or wide one in one of a few, and some by more filters: what is made
+/// soonest.
 #[test]
 fn a_turn_through_the_matrix_is_that_of_the_cpu() {
     let Some(mut bench) = Bench::new() else { return };
-    let cloud = subjects("oracle/oracle_64.vdb").swap_remove(0);
-    for form in bench.named(&UNLIKE_FORMS) {
-        bench.add(&cloud, form, Beside::Nothing);
-    }
-    bench.hold(&[Part::Density]);
     let files = SMALL_FILES.iter().chain(&WIDE_FILES);
     let all: Vec<Subject> = files.flat_map(|file| subjects(file)).collect();
-    let few = bench.named(&["f16", "u4", "bc7z"]);
-    for (turn, subject) in all.iter().enumerate() {
-        bench.add(subject, few[turn % few.len()], Beside::Nothing);
+    // Textures and the other widths of codes have tests of their own.
+    for form in bench.named(&["channel", "f32", "u5", "s3", "g4", "l2", "bc4z", "bc3y", "bc7x", "45 dB"]) {
+        bench.hold(form, &[&all[0]], &[Part::Density]);
     }
-    bench.hold(&[Part::Density, Part::Hits]);
-    for subject in all.iter().step_by(4) {
-        bench.add(subject, few[0], Beside::Nothing);
+    let few = bench.named(&["f16", "u4"]);
+    for (i, form) in few.iter().enumerate() {
+        let chosen: Vec<&Subject> = all.iter().skip(i).step_by(few.len()).collect();
+        bench.hold(*form, &chosen, &[Part::Density, Part::Hits]);
     }
-    bench.hold(&[Part::Steps(Filter::Nearest), Part::March(Lookup::Trilinear)]);
-    bench.matrix.print();
+    let chosen: Vec<&Subject> = all.iter().step_by(4).collect();
+    bench.hold(few[0], &chosen, &[Part::Steps(Filter::Nearest), Part::March(Lookup::Trilinear)]);
+    bench.matrix.print("");
     bench.matrix.check();
 }

@@ -10,7 +10,7 @@ use nuage_gpu::look::{Look, Pass};
 use nuage_gpu::renderer::Renderer;
 use nuage_gpu::upload::Volume as GpuVolume;
 use nuage_pipeline::import::{import, import_surface, is_level_set};
-use nuage_pipeline::pack::options::{Bound, ChannelOptions, Options};
+use nuage_pipeline::pack::options::{Bound, Options};
 use nuage_pipeline::select::is_drawable;
 use nuage_render::depth::stepped_transmittance;
 use nuage_render::filter::{Filter, Lookup};
@@ -21,7 +21,7 @@ use nuage_render::scene::{Phase, Scene, Shape, Volume};
 use nuage_render::surface::{SurfaceHit, VoxelHit, first_hit, first_voxel};
 use nuage_render::traverse::Field;
 use nuage_render::views::{View, render_view};
-use nuage_vdb::{Grid, TreeBuilder};
+use nuage_vdb::Grid;
 use nuage_volume::channel::Channel;
 use nuage_volume::codec::Codec;
 use nuage_volume::codec::block::{BlockFormat, PackingAxis};
@@ -32,18 +32,6 @@ use super::{packed, unpacked_as};
 pub struct Subject {
     pub name: String,
     pub grid: Grid,
-}
-
-impl Subject {
-    /// Whether it may have a map beside [`Beside::Map`].
-    pub fn is_small(&self) -> bool {
-        let channel = import(self.grid.clone()).expect("a linear transform").0;
-        channel.active_box.is_some_and(|b| {
-            let sides: IVec3 = (b.max >> 3) - (b.min >> 3) + 4;
-            let sides = sides.as_i64vec3();
-            sides.cmplt(glam::I64Vec3::splat(MAPPED_CELLS)).all() && sides.element_product() < MAPPED_CELLS
-        }) && !is_level_set(&self.grid)
-    }
 }
 
 /// A form in which a device has bricks.
@@ -93,73 +81,6 @@ pub fn forms(textures: Bricks) -> Vec<Form> {
     mixture("35 dB with shapes", Options { psnr: Some(35.0), shapes: 16, ..Options::default() });
     mixture("error of 2 %", Options { max_error: Some(Bound::OfPeak(0.02)), ..nothing.clone() });
     forms
-}
-
-/// What stands beside a volume on the device. Shaders leave out what does not occur, and each takes a device in software
-/// seconds to make: with every codec beside them, one serves all volumes.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Beside {
-    /// Nothing: shaders are made for the form alone.
-    Nothing,
-    /// Every codec, in so many bricks that the bricks of all are looked up in maps.
-    Map,
-    /// Every codec, so far apart that they are looked up in trees, and values that do not mean themselves.
-    Tree,
-}
-
-/// The bricks of a volume that may have a map beside [`Beside::Map`].
-const MAPPED_CELLS: i64 = 1500;
-
-impl Beside {
-    /// The grids, and the codec of each. What partly is empty is packed by what it takes.
-    ///
-    /// They stand in the space of another grid, from its first brick on, so that all are near the origin that shaders count from.
-    fn grids(self, like: &Grid, first: [i32; 3]) -> Vec<(Grid, ChannelOptions)> {
-        let block = |format| Codec::Block { format, axis: PackingAxis::Z };
-        let codecs = [
-            Some(Codec::F32),
-            Some(Codec::F16),
-            Some(Codec::Uniform { bits: 4 }),
-            Some(Codec::Uniform { bits: 3 }),
-            Some(Codec::Split { bits: 3 }),
-            Some(Codec::Gradient { bits: 3 }),
-            Some(Codec::Lattice { bits: 2 }),
-            Some(block(BlockFormat::Bc4)),
-            Some(block(BlockFormat::Bc3)),
-            Some(block(BlockFormat::Bc7)),
-            None,
-        ];
-        let grid = |(number, codec): (usize, Option<Codec>)| {
-            let mut builder = TreeBuilder::new(0.0_f32, nuage_vdb::Shape::STANDARD);
-            let bricks: Vec<[i32; 3]> = match (self, codec) {
-                (Beside::Nothing, _) => Vec::new(),
-                (Beside::Map, Some(Codec::F32)) => (0..64).map(|i| [i & 3, i >> 2 & 3, i >> 4]).collect(),
-                (Beside::Tree, Some(Codec::F32)) => vec![[0; 3], [160; 3]],
-                _ => vec![[0; 3]],
-            };
-            for brick in bricks {
-                let values: [f32; 512] = std::array::from_fn(|i| {
-                    let is_there = codec.is_some() || i % 64 < 20;
-                    if is_there { 0.1 + (i * 37 % 64) as f32 / 80.0 } else { 0.0 }
-                });
-                let bits = |word: usize| {
-                    (0..64).filter(|bit| values[64 * word + bit] > 0.0).fold(0, |mask, bit| mask | 1 << bit)
-                };
-                builder.leaf(
-                    std::array::from_fn(|i| 8 * brick[i] + (first[i] & !7)),
-                    &std::array::from_fn::<u64, 8, _>(bits),
-                    &values,
-                );
-            }
-            let tree = builder.build().expect("a tree");
-            let options = match codec {
-                Some(codec) => ChannelOptions { codec: Some(codec), ..ChannelOptions::default() },
-                None => ChannelOptions { psnr: Some(30.0), ..ChannelOptions::default() },
-            };
-            (Grid::new(&format!("beside {number}"), like.transform.clone(), tree), options)
-        };
-        if self == Beside::Nothing { Vec::new() } else { codecs.into_iter().enumerate().map(grid).collect() }
-    }
 }
 
 /// The drawable grids of a file below the data.
@@ -266,9 +187,10 @@ impl Matrix {
         assert!(seen > 0, "nothing is seen");
     }
 
-    /// Prints a line for each form and pass.
-    pub fn print(&self) {
-        for ((form, pass), t) in &self.tallies {
+    /// Prints a line for each pass of a form, or of all.
+    pub fn print(&self, of_form: &str) {
+        let mine = || self.tallies.iter().filter(|((form, _), _)| of_form.is_empty() || form == of_form);
+        for ((form, pass), t) in mine() {
             println!(
                 "{form:18} {pass:24} {:4} pictures, {:9} pixels, {:8} seen, {:8.4} % good, mean {:.1e}, worst {:.1e} ({})",
                 t.pictures,
@@ -280,7 +202,7 @@ impl Matrix {
                 t.worst_at
             );
         }
-        for ((form, pass), t) in &self.tallies {
+        for ((form, pass), t) in mine() {
             t.failed.iter().for_each(|failed| println!("FAILED {form}, {pass}, {failed}"));
             t.left_out.iter().for_each(|at| println!("LEFT OUT {form}, {pass}, {at}"));
         }
@@ -334,13 +256,13 @@ pub struct Pair {
 }
 
 /// A volume in a form; as a surface too, if it is a level set.
-pub fn pairs(gpu: &Gpu, subject: &Subject, form: &Form, beside: Beside) -> Vec<Pair> {
-    let fog = pair(gpu, subject, form, beside, false);
-    let surface = is_level_set(&subject.grid).then(|| pair(gpu, subject, form, beside, true));
+pub fn pairs(gpu: &Gpu, subject: &Subject, form: &Form) -> Vec<Pair> {
+    let fog = pair(gpu, subject, form, false);
+    let surface = is_level_set(&subject.grid).then(|| pair(gpu, subject, form, true));
     fog.into_iter().chain(surface.flatten()).collect()
 }
 
-fn pair(gpu: &Gpu, subject: &Subject, form: &Form, beside: Beside, is_surface: bool) -> Option<Pair> {
+fn pair(gpu: &Gpu, subject: &Subject, form: &Form, is_surface: bool) -> Option<Pair> {
     let channel_of = |grid: Grid| match is_surface {
         true => import_surface(grid).expect("a linear transform").0,
         false => import(grid).expect("a linear transform").0,
@@ -360,24 +282,14 @@ fn pair(gpu: &Gpu, subject: &Subject, form: &Form, beside: Beside, is_surface: b
     let mut grid = subject.grid.clone();
     let band = report.level_set_band;
     grid.name = "shown".to_owned();
-    let box_min = import(grid.clone()).expect("a linear transform").0.active_box?.min.to_array();
-    let (mut grids, mut options) = (vec![grid], options.clone());
-    for (grid, asked) in beside.grids(&subject.grid, box_min) {
-        options.channels.push((grid.name.clone(), asked));
-        grids.push(grid);
-    }
-    let asset = packed(&[grids], &options);
+    let asset = packed(&[vec![grid]], options);
     let channel = unpacked_as(&asset, 0, "shown", channel_of)?;
     let meaning = match (band, is_surface) {
         (None, _) => Meaning::Density,
         (Some(band), false) => Meaning::Fog { band },
         (Some(band), true) => Meaning::Surface { band },
     };
-    let mut wanted = vec![Wanted { name: "shown".to_owned(), meaning }];
-    wanted.extend(options.channels.into_iter().map(|(name, _)| Wanted {
-        name,
-        meaning: if beside == Beside::Tree { Meaning::Fog { band: 1.0 } } else { Meaning::Density },
-    }));
+    let wanted = [Wanted { name: "shown".to_owned(), meaning }];
     let arrays = match Arrays::of_asset(&asset, &wanted, 0..1, form.bricks) {
         // Refused, since shaders take it that nothing is where nothing stands.
         Err(GpuError::Unsupported { feature }) if feature.contains("not empty") => return None,
