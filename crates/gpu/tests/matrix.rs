@@ -164,9 +164,10 @@ impl Bench {
 }
 
 /// All forms of the volumes that differ, by all filters: those that share a decoder with another of each third volume in turn,
-/// and large volumes and those that are like others in a form each, in turn. Prints what it found.
+/// and large volumes and those that are like others in a form each, in turn. Prints what it found. `NUAGE_FORMS` names the forms
+/// that are wanted, with commas between them.
 #[test]
-#[ignore = "takes an hour"]
+#[ignore = "takes minutes for each form on a device in software"]
 fn the_whole_matrix_is_that_of_the_cpu() {
     let Some(mut bench) = Bench::new() else { return };
     let start = Instant::now();
@@ -174,7 +175,11 @@ fn the_whole_matrix_is_that_of_the_cpu() {
     let whole = load(&[&SMALL_FILES[..], &WIDE_FILES[..]].concat());
     let in_turn = load(&[&LIKE_FILES[..], &LARGE_FILES[..]].concat());
     let unlike = bench.named(&UNLIKE_FORMS);
+    let wanted = std::env::var("NUAGE_FORMS").unwrap_or_default();
     for form in 0..bench.forms.len() {
+        if !wanted.is_empty() && !wanted.split(',').any(|name| name == bench.forms[form].name) {
+            continue;
+        }
         let step = if unlike.contains(&form) { 1 } else { 3 };
         let own = whole.iter().skip(form % step).step_by(step);
         let others = in_turn.iter().skip(form).step_by(bench.forms.len());
