@@ -7,7 +7,7 @@
 //!
 //! What does not live here: buffers ([`crate::upload`]), files, and the meaning of grids as media.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::ops::Range;
 
 use glam::{DAffine3, DVec3, IVec3};
@@ -137,6 +137,17 @@ struct Gathered {
     masks: HashMap<u32, u32>,
     nodes: HashMap<(Kind, usize, u32), u32>,
     bricks: HashMap<(usize, u32), u32>,
+    /// The bricks whose values were looked at, each of a channel.
+    seen: HashSet<(usize, u32)>,
+    /// The smallest and the largest value of each channel, as encoding made them.
+    ranges: HashMap<usize, [f32; 2]>,
+}
+
+impl Gathered {
+    fn see(&mut self, channel: usize, values: &[f32]) {
+        let range = self.ranges.entry(channel).or_insert([f32::MAX, f32::MIN]);
+        *range = values.iter().fold(*range, |[min, max], value| [min.min(*value), max.max(*value)]);
+    }
 }
 
 impl Arrays {
@@ -192,7 +203,8 @@ impl Arrays {
     /// that a frame lacks is empty there.
     ///
     /// # Errors
-    /// If there are no such frames, pages are not loaded, bricks are damaged, or a transform is not linear.
+    /// If there are no such frames, pages are not loaded, bricks are damaged, a transform is not linear, or a background is not
+    /// empty: channels of such grids can be taken by [`Arrays::of_channels`].
     pub fn of_asset(
         asset: &Asset,
         wanted: &[Wanted],
@@ -242,11 +254,15 @@ impl Arrays {
                 };
                 let channel = grid.channel as usize;
                 let info = &contents.channels[channel];
-                let [scale, bias, most] = wanted.meaning.line();
-                let peak = (bias + scale * info.peak).max(bias + scale * info.floor).clamp(0.0, most);
-                arrays.largest[largest] = arrays.largest[largest].max(peak);
+                if arrays.is_room {
+                    gathered.see(channel, &[info.floor, info.peak]);
+                }
                 let place = arrays.gather(asset, channel, grid, form, wanted.meaning, &mut gathered)?;
                 arrays.places.push(place);
+                let [scale, bias, most] = wanted.meaning.line();
+                let range = gathered.ranges.get(&channel).copied().unwrap_or_default();
+                let ends = range.map(|value| bias + scale * value);
+                arrays.largest[largest] = arrays.largest[largest].max(ends[0].max(ends[1]).clamp(0.0, most));
             }
         }
         arrays.settle();
@@ -336,6 +352,13 @@ impl Arrays {
         gathered: &mut Gathered,
     ) -> Result<Option<Place>, GpuError> {
         let (Some([min, max]), Some(tree)) = (grid.active_box, grid.levels.first()) else { return Ok(None) };
+        // Where nothing stands, shaders take it that nothing is.
+        let [scale, bias, most] = meaning.line();
+        if (bias + scale * tree.background).clamp(0.0, most) > 0.0 {
+            return Err(GpuError::Unsupported {
+                feature: "a packed grid that is not empty where it has no voxels",
+            });
+        }
         let columns = grid
             .world_from_index
             .ok_or(GpuError::Unsupported { feature: "a transform that is not linear" })?;
@@ -363,7 +386,14 @@ impl Arrays {
         form: Bricks,
         gathered: &mut Gathered,
     ) -> Result<Entry, GpuError> {
-        let Some(Content::Node(index)) = entry.content() else { return Ok(entry) };
+        let index = match entry.content() {
+            Some(Content::Node(index)) => index,
+            Some(Content::Constant(value)) => {
+                gathered.see(channel, &[value]);
+                return Ok(entry);
+            }
+            _ => return Ok(entry),
+        };
         let key = (kind, channel, index);
         let payload = match gathered.nodes.get(&key) {
             Some(known) => *known,
@@ -405,7 +435,20 @@ impl Arrays {
         form: Bricks,
         gathered: &mut Gathered,
     ) -> Result<Entry, GpuError> {
-        let Some(Content::Brick { codec, offset }) = entry.content() else { return Ok(entry) };
+        let (codec, offset) = match entry.content() {
+            Some(Content::Brick { codec, offset }) => (codec, offset),
+            Some(Content::Constant(value)) => {
+                gathered.see(channel, &[value]);
+                return Ok(entry);
+            }
+            _ => return Ok(entry),
+        };
+        // Decoding is also what finds a damaged brick before a shader meets it.
+        let mut values = [0.0; BRICK_VOXELS];
+        if !self.is_room && gathered.seen.insert((channel, offset)) {
+            asset.decode(channel, codec, offset, &mut values)?;
+            gathered.see(channel, &values);
+        }
         // Words mean the same in all channels, values do not.
         let (key, kept) = match form {
             Bricks::AsStored | Bricks::Textures => ((0, offset), codec),
@@ -416,11 +459,6 @@ impl Arrays {
             None => {
                 let at = u32::try_from(self.words.len() + BRICK_VOXELS).map_err(|_| too_many_words())?;
                 let at = at - BRICK_VOXELS as u32;
-                // Decoding is also what finds a damaged brick before a shader meets it.
-                let mut values = [0.0; BRICK_VOXELS];
-                if !self.is_room {
-                    asset.decode(channel, codec, offset, &mut values)?;
-                }
                 match form {
                     Bricks::Decoded => self.words.extend(values.iter().map(|value| value.to_bits())),
                     Bricks::AsStored | Bricks::Textures => {

@@ -25,6 +25,8 @@ pub struct Gpu {
     queue: wgpu::Queue,
     name: String,
     fault: Arc<Mutex<Option<GpuError>>>,
+    /// Whether it says so by itself when it is lost.
+    is_own: bool,
     /// Whether textures of blocks are read right, once that was tried.
     reads_blocks: Arc<OnceLock<bool>>,
 }
@@ -85,7 +87,7 @@ impl Gpu {
         };
         let opened = pollster::block_on(adapter.request_device(&descriptor));
         let (device, queue) = opened.map_err(|error| GpuError::Device(error.to_string()))?;
-        let gpu = Gpu::from_host(device, queue, name_of(adapter));
+        let gpu = Gpu { is_own: true, ..Gpu::from_host(device, queue, name_of(adapter)) };
         // A device of our own tells us of its faults; by default they would end the program.
         let fault = Arc::clone(&gpu.fault);
         gpu.device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| keep(&fault, fault_of(&error))));
@@ -96,7 +98,7 @@ impl Gpu {
 
     /// A device that somebody else opened and goes on using. Its handlers of faults stay as they are.
     pub fn from_host(device: wgpu::Device, queue: wgpu::Queue, name: String) -> Gpu {
-        Gpu { device, queue, name, fault: Arc::default(), reads_blocks: Arc::default() }
+        Gpu { device, queue, name, fault: Arc::default(), is_own: false, reads_blocks: Arc::default() }
     }
 
     /// The name of the device.
@@ -193,7 +195,7 @@ impl Gpu {
         let waited = catch_unwind(poll).map_err(|_| GpuError::Lost)?;
         waited.map_err(|error| GpuError::Device(error.to_string()))?;
         self.health()?;
-        if self.is_lost() { Err(GpuError::Lost) } else { Ok(()) }
+        if !self.is_own && self.is_lost() { Err(GpuError::Lost) } else { Ok(()) }
     }
 
     /// A buffer of these bytes.

@@ -16,7 +16,7 @@ use crate::error::GpuError;
 use crate::params::{LightParams, MediumParams, Params, Place, SHAPE_BALL, SHAPE_BOX, SHAPE_GRID};
 pub use crate::params::{MAX_LIGHTS, MAX_MEDIA};
 use crate::real_time::RealTime;
-use crate::shader::SOLID_CHANNEL;
+use crate::shader::{SOLID_CHANNEL, TELLING_TURNS};
 use crate::upload::Volume;
 
 /// The shortest step of [`Pass::Opacity`]: no more than seven samples then lie in a voxel, even from corner to corner.
@@ -200,6 +200,7 @@ impl Look {
             size: [width, height, frame as u32, 0],
             counts: [1, u32::MAX, 0, self.lights.len() as u32],
             tone: [1.0, 1.0, 1.0, 1.0],
+            map_size: [0, 0, TELLING_TURNS, 0],
             ..Params::default()
         };
         for (slot, medium) in params.media.iter_mut().zip(&self.media) {
@@ -221,7 +222,7 @@ impl Look {
                 let row = |row: Vec3| row.extend(0.0).to_array();
                 (params.map_x, params.map_y, params.map_z) =
                     (row(rows.x_axis), row(rows.y_axis), row(rows.z_axis));
-                params.map_size = [parts.width, parts.height, 0, 0];
+                params.map_size = [parts.width, parts.height, TELLING_TURNS, 0];
             }
             even @ Sky::Constant(_) => {
                 let radiance = even.radiance(Vec3::Y).extend(0.0).to_array();

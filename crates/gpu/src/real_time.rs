@@ -11,6 +11,9 @@
 //!
 //! What does not live here: pipelines and the order of passes ([`crate::renderer`]).
 
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
 use glam::DVec3;
 use nuage_render::filter::Lookup;
 use nuage_render::march::Quality;
@@ -77,6 +80,17 @@ struct Filled {
     lattice: [[f32; 4]; 6],
 }
 
+/// Says that a light volume was not filled when it is dropped before the encoder that fills it is done.
+struct Awaited(Option<Arc<AtomicBool>>);
+
+impl Drop for Awaited {
+    fn drop(&mut self) {
+        if let Some(is_missing) = self.0.take() {
+            is_missing.store(true, Ordering::Relaxed);
+        }
+    }
+}
+
 /// Buffers and textures of the stages, and what goes from one picture to the next.
 #[derive(Debug)]
 pub(crate) struct Stages {
@@ -89,6 +103,8 @@ pub(crate) struct Stages {
     before: wgpu::Buffer,
     kept: [wgpu::Texture; 2],
     filled: Option<Filled>,
+    /// Whether an encoder that was to fill it was dropped.
+    is_missing: Arc<AtomicBool>,
     /// What the picture before was told, of which volume it was, and where its world began.
     last: Option<(Params, Content, DVec3)>,
     number: u32,
@@ -210,6 +226,7 @@ impl Stages {
             before,
             kept: [kept_before, kept],
             filled: None,
+            is_missing: Arc::default(),
             last: None,
             number: 0,
             budget: Budget::default(),
@@ -345,7 +362,8 @@ impl Stages {
                 lookup: features.lookup,
                 lattice,
             };
-            if self.filled.as_ref() != Some(&filled) {
+            let is_missing = self.is_missing.swap(false, Ordering::Relaxed);
+            if is_missing || self.filled.as_ref() != Some(&filled) {
                 stages.push(Source::LightVolume);
                 self.filled = Some(filled);
             }
@@ -395,6 +413,12 @@ impl Stages {
     }
 
     /// Records the way back of times.
+    /// Notices whether an encoder that fills the light volume is dropped.
+    pub(crate) fn await_fill(&self, encoder: &wgpu::CommandEncoder) {
+        let mut awaited = Awaited(Some(self.is_missing.clone()));
+        encoder.on_submitted_work_done(move || drop(awaited.0.take()));
+    }
+
     pub(crate) fn send_times_back(&mut self, encoder: &mut wgpu::CommandEncoder) {
         let is_wanted = self.measures.budget_ms.is_some();
         if let Some(timer) = self.timer.as_mut().filter(|_| is_wanted) {

@@ -30,6 +30,10 @@ pub(crate) const WORKGROUP_SIDE: u32 = 8;
 /// would keep a device busy until its driver takes it for lost.
 const MAX_DRAWS: u32 = 1 << 20;
 const MAX_LEAPS: u32 = 1 << 16;
+/// The opacity of a pixel that cannot be known, since the driver left loops before their end.
+pub(crate) const UNSOUND: f32 = f32::MIN;
+/// The turns of the loop that tells, which a loop that is left after one does not take.
+pub(crate) const TELLING_TURNS: u32 = 2;
 /// The words in front of the arrays of trees that say where each begins.
 pub(crate) const HEADER_WORDS: usize = 8;
 
@@ -278,7 +282,9 @@ impl Source {
                 state: "VoxelHit",
                 layer: Layer::Voxel,
                 enter: "",
-                step: "if (value > (*state).above && t0 < t1) {
+                // By rounding a ray may begin beside the active voxels, where anything is stored.
+                step: "if (value > (*state).above && t0 < t1
+                    && is_active(field, (brick << vec3<u32>(LOG2_BRICK)) + local_of(cell))) {
                 *state = VoxelHit(true, (*state).above, t0, brick, cell, value);
                 return;
             }",
@@ -685,9 +691,8 @@ fn prelude(features: &Features) -> String {
     p.u("MAX_ROOT_LEAPS", traverse::MAX_ROOT_LEAPS);
     p.i("MAX_ROOT_LEAP", traverse::MAX_ROOT_LEAP as i32);
     p.u("MOST_REFINEMENTS", surface::MOST_REFINEMENTS);
-    // Gauss' rule of two points, and a part of a brick that tells which side of a face a ray goes to.
+    // Gauss' rule of two points.
     p.f("GAUSS_NODE", 1.0 / 3.0_f32.sqrt());
-    p.f("GAUSS_NUDGE", 1e-5);
     p.f("LIT_PIECE_DEPTH", march::LIT_PIECE_DEPTH);
     p.f("LIT_PIECE_VOXELS", march::LIT_PIECE_VOXELS);
     p.f("MOST_PIECES", march::MOST_PIECES);
@@ -731,6 +736,9 @@ fn prelude(features: &Features) -> String {
     p.f("UPSAMPLE_TOLERANCE", real_time::UPSAMPLE_TOLERANCE);
     p.f("KEPT_TOLERANCE", real_time::KEPT_TOLERANCE);
     p.b("ENCODES_SRGB", features.encodes_srgb);
+    // What is accumulated would not forget.
+    p.b("CHECKS_LOOPS", !features.is_real_time && !features.counts);
+    p.f("UNSOUND", UNSOUND);
     for (i, name) in [
         "VIEW_DENSITY",
         "VIEW_DEPTH",

@@ -370,6 +370,12 @@ fn look_ups_are_counted_and_pictures_timed() {
     renderer.prepare(&volume, &look, &pass, 0, None).expect("a pass");
     renderer.run(&volume).expect("a run");
     assert_eq!(renderer.pixels().expect("pixels"), before, "counting leaves pictures as they are");
+    let quality = Quality { sky_rays: 0, ..Quality::default() };
+    let marched = renderer.count(&volume, &look, &Pass::March(quality), 0).expect("counts");
+    assert!(marched.rays > counts.rays && marched.values > counts.values, "shadow rays as well: {marched:?}");
+    let measures = nuage_gpu::real_time::RealTime::default();
+    let counted = renderer.count(&volume, &look, &Pass::RealTime { quality, measures }, 0);
+    assert!(counted.is_err(), "{counted:?}");
     look.camera.forward = -look.camera.forward;
     let counts = renderer.count(&volume, &look, &pass, 0).expect("counts");
     assert_eq!((counts.rays, counts.regions, counts.values), (0, 0, 0), "it is behind the camera");

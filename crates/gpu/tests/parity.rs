@@ -269,3 +269,33 @@ fn marched_pictures_look_values_up_as_on_the_cpu() {
         }
     }
 }
+
+/// A cloud of 64³ voxels by cubes and exact shadow rays, and in so many steps that lavapipe leaves loops before their end: the
+/// picture is that of the CPU, or there is none.
+#[test]
+fn loops_that_are_left_are_found_out() {
+    let Some(gpu) = gpu() else { return };
+    let channel = cloud();
+    let scene = lit(&channel);
+    let look = Look::of_scene(&scene).expect("a look");
+    let volume = uploaded(&gpu, &[&channel]);
+    let size = [48, 32];
+    let mut renderer = Renderer::new(&gpu, size).expect("a renderer");
+    let exact = Quality { lookup: Lookup::Tricubic, shadow_step_voxels: 0.0, ..Quality::default() };
+    let endless = Quality { step_voxels: 0.01, shadow_step_voxels: 0.05, samples: 8, ..exact };
+    for (name, quality) in [("exact shadows", exact), ("short steps", endless)] {
+        renderer.prepare(&volume, &look, &Pass::March(quality), 0, None).expect("a pass");
+        renderer.run(&volume).expect("a run");
+        match renderer.pixels() {
+            Ok(ours) => {
+                assert!(name != "short steps" || !gpu.name().contains("llvmpipe"), "{name} are shown");
+                let theirs = nuage_render::picture::render(&scene, quality, size[0], size[1], &|_, _| ());
+                hold(name, &ours, &theirs.expect("a picture").pixels);
+            }
+            Err(error) => {
+                println!("{name}: {error}");
+                assert!(error.to_string().contains("loops") && gpu.name().contains("llvmpipe"), "{error}");
+            }
+        }
+    }
+}

@@ -10,6 +10,9 @@ use std::sync::Arc;
 use common::paths::compare;
 use common::{bent, channel_of, cloud, gpu, grid, lit};
 use glam::{DAffine3, DQuat, DVec3, IVec3, Vec3};
+use nuage_gpu::device::Gpu;
+use nuage_gpu::look::{Look, Pass, channels_of};
+use nuage_gpu::renderer::Renderer;
 use nuage_render::camera::Camera;
 use nuage_render::color::Blackbody;
 use nuage_render::envmap::{self, EnvironmentMap};
@@ -17,8 +20,11 @@ use nuage_render::filter::Lookup;
 use nuage_render::framing::WorldBox;
 use nuage_render::light::{Light, Sky, Spot, Sun};
 use nuage_render::lod::coarser_by;
+use nuage_render::march::{Quality, unsupported};
 use nuage_render::path::PathSettings;
 use nuage_render::scene::{Emission, Phase, Scene, Shape, Spectrum, Volume};
+use nuage_render::traverse::Field;
+use nuage_render::views::{View, render_view};
 use nuage_volume::channel::Channel;
 
 #[test]
@@ -115,6 +121,28 @@ fn scenes_of_the_oracle_are_those_of_the_cpu() {
         ("homog_sphere_furnace", oracle(ball, 4.0, white, 0.5, white, false), any),
     ] {
         compare(name, &gpu, &scene, settings);
+        if unsupported(&scene).is_none() {
+            march(name, &gpu, &scene);
+        }
+    }
+}
+
+/// Holds a scene's picture of one scattering to that of the CPU, and what its rays meet.
+fn march(name: &str, gpu: &Gpu, scene: &Scene<'_>) {
+    let size = [96, 64];
+    let mut renderer = Renderer::new(gpu, size).expect("a renderer");
+    let volume = common::uploaded(gpu, &channels_of(scene));
+    let look = Look::of_scene(scene).expect("a look");
+    let quality = Quality { step_voxels: 1.0, sky_rays: 4, ..Quality::default() };
+    let ours = common::picture(&mut renderer, &volume, &look, &Pass::March(quality), 0);
+    let theirs = nuage_render::picture::render(scene, quality, size[0], size[1], &|_, _| ());
+    common::hold(&format!("{name}, marched"), &ours, &theirs.expect("a picture").pixels);
+    let Shape::Grid(channel) = scene.volumes[0].shape else { return };
+    let field = Field::new(channel).expect("a field");
+    for view in [View::Density { extinction: scene.volumes[0].extinction[0] }, View::Depth] {
+        let ours = common::picture(&mut renderer, &volume, &look, &Pass::View(view), 0);
+        let theirs = render_view(&field, view, &scene.camera, size, &|_, _| ()).expect("a picture");
+        common::hold(&format!("{name}, {view:?}"), &ours, &theirs.pixels);
     }
 }
 

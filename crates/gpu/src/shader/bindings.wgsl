@@ -97,7 +97,8 @@ struct Params {
     before_up: vec4<f32>,
     // The most pictures that a mean counts as, whether colours before are clamped, whether the camera moved.
     history: vec4<f32>,
-    // Rows of what takes the world to the map of the sky, and its width and height.
+    // Rows of what takes the world to the map of the sky, and its width and height; then how many turns a loop takes that is to
+    // tell whether loops take all of theirs.
     map_x: vec4<f32>,
     map_y: vec4<f32>,
     map_z: vec4<f32>,

@@ -15,13 +15,17 @@ fn line_integral(field: u32, local: LocalRay, end: f32) -> f32 {
             sum += found.run.value * (found.run.t1 - found.run.t0);
             continue;
         }
+        // From brick to brick by whole numbers, so that rounding never holds the ray up at a face.
         var t = found.run.t0;
+        var brick = floor(ray_at(local, t) / BRICK_SIDE);
         while (t < found.run.t1) {
-            // From cell to cell, by where the middle of what is left of the brick begins.
-            let corner = floor(ray_at(local, t) / BRICK_SIDE + GAUSS_NUDGE * sign(local.direction)) * BRICK_SIDE;
-            let leaves = interval_in(local, corner, corner + BRICK_SIDE).y;
-            var cells = cells_between(local, t, min(leaves, found.run.t1), corner);
-            let before = t;
+            let corner = brick * BRICK_SIDE;
+            let far = select(corner, corner + BRICK_SIDE, local.direction >= vec3<f32>(0.0));
+            let is_still = local.direction == vec3<f32>(0.0);
+            let faces = select((far - local.origin) * local.inverse, vec3<f32>(MAX_F32), is_still);
+            let leaves = min_component(faces);
+            let end = clamp(leaves, t, found.run.t1);
+            var cells = cells_between(local, t, end, corner);
             while (cells.t < cells.end) {
                 let cell = next_cell(&cells);
                 let half = 0.5 * (cell.t1 - cell.t0);
@@ -34,11 +38,10 @@ fn line_integral(field: u32, local: LocalRay, end: f32) -> f32 {
                 let apart = local.direction * (half * GAUSS_NODE);
                 sum += half * (lerp8(c, middle - apart) + lerp8(c, middle + apart));
             }
-            t = cells.t;
-            if (t <= before) {
-                // Rounding: on to the next float.
-                t = bitcast<f32>(bitcast<u32>(max(before, MIN_F32)) + 1u);
-            }
+            t = end;
+            let is_x = faces.x <= leaves;
+            let is_y = !is_x && faces.y <= leaves;
+            brick += select(vec3<f32>(0.0), sign(local.direction), vec3<bool>(is_x, is_y, !(is_x || is_y)));
         }
     }
     return sum;

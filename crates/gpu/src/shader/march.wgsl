@@ -369,5 +369,6 @@ fn march(@builtin(global_invocation_id) id: vec3<u32>) {
         opacity += 1.0 - progress.transmittance;
     }
     keep_depth(id.xy, progress.depth_moment / max(opacity, MIN_F32));
-    picture[id.y * params.marched.x + id.x] = vec4<f32>(progress.scattered, opacity) / f32(samples);
+    let mean = vec4<f32>(progress.scattered, opacity) / f32(samples);
+    picture[id.y * params.marched.x + id.x] = shown(sound(mean));
 }

@@ -9,8 +9,9 @@ fn whole_screen(@builtin(vertex_index) i: u32) -> @builtin(position) vec4<f32> {
 @fragment
 fn tone(@builtin(position) position: vec4<f32>) -> @location(0) vec4<f32> {
     let pixel = min(vec2<u32>(position.xy * params.tone.zw), params.size.xy - 1u);
-    let value = picture_read[pixel.y * params.size.x + pixel.x] * params.tone.y;
-    let light = max(value.xyz * params.tone.x, vec3<f32>(0.0));
+    // Nothing where what a pixel shows cannot be known.
+    let value = max(picture_read[pixel.y * params.size.x + pixel.x] * params.tone.y, vec4<f32>(0.0));
+    let light = value.xyz * params.tone.x;
     if (ENCODES_SRGB) {
         let clamped = min(light, vec3<f32>(1.0));
         return vec4<f32>(linear_to_srgb(clamped.x), linear_to_srgb(clamped.y), linear_to_srgb(clamped.z), value.w);

@@ -5,6 +5,7 @@
 #![allow(unreachable_pub, reason = "a module of test binaries, not of a library")]
 #![allow(clippy::print_stdout, reason = "the measured errors are worth reading")]
 
+pub mod matrix;
 pub mod paths;
 
 use std::convert::Infallible;
@@ -213,16 +214,28 @@ pub fn packed(frames: &[Vec<Grid>], options: &Options) -> Asset {
 
 /// A grid of a frame of a packed volume, as the CPU renders it.
 pub fn unpacked(asset: &Asset, frame: usize, name: &str) -> Channel {
+    unpacked_as(asset, frame, name, |grid| {
+        nuage_pipeline::import::import(grid).expect("a linear transform").0
+    })
+    .expect("voxels")
+}
+
+/// The same, as what its values are taken for; `None` if it has no voxels.
+pub fn unpacked_as(
+    asset: &Asset,
+    frame: usize,
+    name: &str,
+    import: impl FnOnce(Grid) -> Channel,
+) -> Option<Channel> {
     let (grids, _) = unpack_frame(asset, frame).expect("a frame");
-    let grid = grids.into_iter().find(|grid| grid.name == name).expect("the grid");
-    let mut channel = nuage_pipeline::import::import(grid).expect("a linear transform").0;
+    let grid = grids.into_iter().find(|grid| grid.name == name)?;
+    let mut channel = import(grid);
     // BC4 has no exact zero beside what it blends: what spills beyond the source's box would move where rays begin to step.
     let contents = asset.contents();
     let is_same = |grid: &&FrameGrid| contents.channels[grid.channel as usize].name == name;
-    let [min, max] =
-        contents.frames[frame].grids.iter().find(is_same).and_then(|grid| grid.active_box).expect("voxels");
+    let [min, max] = contents.frames[frame].grids.iter().find(is_same).and_then(|grid| grid.active_box)?;
     channel.active_box = Some(IndexBox { min: IVec3::from_array(min), max: IVec3::from_array(max) });
-    channel
+    Some(channel)
 }
 
 /// A renderer of pictures to be compared. Keep it: its pipelines take seconds on a device in software.

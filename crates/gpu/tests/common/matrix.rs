@@ -1,0 +1,462 @@
+//! The matrix of volumes, forms of bricks and filters, each cell of which is a picture of the GPU held to that of the CPU.
+
+use std::collections::BTreeMap;
+
+use glam::{DVec2, DVec3, IVec3};
+use nuage_gpu::arrays::{Arrays, Bricks, Meaning, Wanted};
+use nuage_gpu::device::Gpu;
+use nuage_gpu::error::GpuError;
+use nuage_gpu::look::{Look, Pass};
+use nuage_gpu::renderer::Renderer;
+use nuage_gpu::upload::Volume as GpuVolume;
+use nuage_pipeline::import::{import, import_surface, is_level_set};
+use nuage_pipeline::pack::options::{Bound, Options};
+use nuage_pipeline::select::is_drawable;
+use nuage_render::depth::stepped_transmittance;
+use nuage_render::filter::{Filter, Lookup};
+use nuage_render::framing::{WorldBox, fit_camera, fit_density_scale};
+use nuage_render::light::Sun;
+use nuage_render::march::Quality;
+use nuage_render::scene::{Phase, Scene, Shape, Volume};
+use nuage_render::surface::{SurfaceHit, VoxelHit, first_hit, first_voxel};
+use nuage_render::traverse::Field;
+use nuage_render::views::{View, render_view};
+use nuage_vdb::Grid;
+use nuage_volume::channel::Channel;
+use nuage_volume::codec::Codec;
+use nuage_volume::codec::block::{BlockFormat, PackingAxis};
+
+use super::{packed, unpacked_as};
+
+/// What is looked at, by name.
+pub struct Subject {
+    pub name: String,
+    pub grid: Grid,
+}
+
+/// A form in which a device has bricks.
+pub struct Form {
+    pub name: String,
+    /// How they are packed; `None` for a channel that never was.
+    pub options: Option<Options>,
+    pub bricks: Bricks,
+}
+
+/// All forms: every codec that an encoder can be told to use, what it chooses by itself, and floats that never were packed.
+/// Blocks also as textures, in the form that the device takes them best, and one codec decoded at upload.
+pub fn forms(textures: Bricks) -> Vec<Form> {
+    let nothing = Options { max_error: None, psnr: None, ..Options::default() };
+    let of = |name: &str, codec, bricks| Form {
+        name: name.to_owned(),
+        options: Some(Options { codec: Some(codec), ..nothing.clone() }),
+        bricks,
+    };
+    let mut forms = vec![Form { name: "channel".to_owned(), options: None, bricks: Bricks::AsStored }];
+    forms.push(of("f32", Codec::F32, Bricks::AsStored));
+    forms.push(of("f16", Codec::F16, Bricks::AsStored));
+    for bits in 1..=8 {
+        forms.push(of(&format!("u{bits}"), Codec::Uniform { bits }, Bricks::AsStored));
+    }
+    for bits in 1..=8 {
+        forms.push(of(&format!("s{bits}"), Codec::Split { bits }, Bricks::AsStored));
+    }
+    for bits in 0..=8 {
+        forms.push(of(&format!("g{bits}"), Codec::Gradient { bits }, Bricks::AsStored));
+    }
+    for bits in 0..=5 {
+        forms.push(of(&format!("l{bits}"), Codec::Lattice { bits }, Bricks::AsStored));
+    }
+    for (format, name) in [(BlockFormat::Bc4, "bc4"), (BlockFormat::Bc3, "bc3"), (BlockFormat::Bc7, "bc7")] {
+        for (axis, letter) in [(PackingAxis::X, 'x'), (PackingAxis::Y, 'y'), (PackingAxis::Z, 'z')] {
+            let codec = Codec::Block { format, axis };
+            forms.push(of(&format!("{name}{letter}"), codec, Bricks::AsStored));
+            forms.push(of(&format!("{name}{letter} texture"), codec, textures));
+        }
+    }
+    forms.push(of("u4 decoded", Codec::Uniform { bits: 4 }, Bricks::Decoded));
+    let mut mixture = |name: &str, options| {
+        forms.push(Form { name: name.to_owned(), options: Some(options), bricks: Bricks::AsStored });
+    };
+    mixture("45 dB", Options::default());
+    mixture("35 dB with shapes", Options { psnr: Some(35.0), shapes: 16, ..Options::default() });
+    mixture("error of 2 %", Options { max_error: Some(Bound::OfPeak(0.02)), ..nothing.clone() });
+    forms
+}
+
+/// The drawable grids of a file below the data.
+pub fn subjects(relative: &str) -> Vec<Subject> {
+    let Some(path) = nuage_testkit::find(relative) else { return Vec::new() };
+    let file = nuage_vdb::File::open(std::fs::read(path).expect("readable")).expect("a VDB file");
+    let name = relative.rsplit('/').next().unwrap_or(relative).trim_end_matches(".vdb");
+    (0..file.grids.len())
+        .filter(|i| is_drawable(&file.grids[*i]))
+        .map(|i| Subject {
+            name: format!("{name} {}", file.grids[i].unique_name),
+            grid: file.read_grid(i).expect("an intact grid"),
+        })
+        // Other transforms are refused.
+        .filter(|subject| subject.grid.transform.matrix().is_some())
+        .collect()
+}
+
+/// What a comparison found.
+#[derive(Default, Clone)]
+pub struct Tally {
+    pub pictures: u32,
+    pub pixels: u64,
+    pub good: u64,
+    pub sum: f64,
+    pub worst: f64,
+    pub worst_at: String,
+    pub seen: u64,
+    pub failed: Vec<String>,
+    pub left_out: Vec<String>,
+    pub is_of_hits: bool,
+}
+
+/// Comparisons by form and by what is shown.
+#[derive(Default)]
+pub struct Matrix {
+    pub tallies: BTreeMap<(String, String), Tally>,
+}
+
+/// Of a picture so many pixels may be off, and so much in the mean: at the faces of nearest voxels rounding decides, and a
+/// picture is small. All pictures of a form together are held to what the renderer promises.
+const MOST_BAD: usize = 4;
+const MOST_MEAN: f64 = 5e-4;
+const PIXELS: usize = (SMALL[0] * SMALL[1]) as usize;
+/// Pictures of the matrix are small.
+pub const SMALL: [u32; 2] = [48, 32];
+
+/// The largest difference of each pixel. Values above 1 count in parts of themselves.
+fn differences(ours: &[[f32; 4]], reference: &[[f32; 4]]) -> Vec<f64> {
+    let error = |(a, b): (&[f32; 4], &[f32; 4])| {
+        a.iter().zip(b).map(|(a, b)| f64::from((a - b).abs() / b.abs().max(1.0))).fold(0.0, f64::max)
+    };
+    ours.iter().zip(reference).map(error).collect()
+}
+
+impl Matrix {
+    /// Notes per-pixel errors, of which `share` may be worse than `tolerance`.
+    fn note(&mut self, form: &str, pass: &str, at: &str, errors: &[f64], seen: usize, tolerance: f64) {
+        let tally = self.tallies.entry((form.to_owned(), pass.to_owned())).or_default();
+        let good = errors.iter().filter(|error| **error <= tolerance).count();
+        let sum: f64 = errors.iter().map(|error| error.min(1.0)).sum();
+        let worst = errors.iter().copied().fold(0.0, f64::max);
+        tally.pictures += 1;
+        tally.pixels += errors.len() as u64;
+        tally.good += good as u64;
+        tally.sum += sum;
+        tally.seen += seen as u64;
+        if worst > tally.worst {
+            (tally.worst, tally.worst_at) = (worst, at.to_owned());
+        }
+        let bad = errors.len() - good;
+        let mean = sum / errors.len() as f64;
+        if bad > MOST_BAD || mean >= MOST_MEAN {
+            tally.failed.push(format!("{at}: {bad} pixels off, mean {mean:.1e}, worst {worst:.1e}"));
+        }
+    }
+
+    /// Colours may differ by 1/255, and by 10⁻⁴ in the mean.
+    fn colours(&mut self, form: &str, pass: &str, at: &str, ours: &[[f32; 4]], reference: &[[f32; 4]]) {
+        let errors = differences(ours, reference);
+        let seen = reference.iter().filter(|pixel| pixel[3] > 0.0).count();
+        self.note(form, pass, at, &errors, seen, 1.0 / 255.0);
+    }
+
+    fn left_out(&mut self, form: &str, pass: &str, at: &str, why: &str) {
+        let tally = self.tallies.entry((form.to_owned(), pass.to_owned())).or_default();
+        tally.left_out.push(format!("{at}: {why}"));
+    }
+
+    /// Holds all pictures of each form and pass, and of each pass in all forms.
+    pub fn check(&self) {
+        let mut failed: Vec<String> = Vec::new();
+        for ((form, pass), tally) in &self.tallies {
+            failed.extend(tally.failed.iter().map(|what| format!("{form}, {pass}, {what}")));
+            let share = tally.good as f64 / tally.pixels.max(1) as f64;
+            let least = if tally.is_of_hits { 0.995 } else { 0.999 };
+            let mean = tally.sum / tally.pixels.max(1) as f64;
+            if tally.pixels > 0 && (share < least || mean >= 1e-4) && tally.pictures > 1 {
+                failed.push(format!("{form}, {pass}: {share} of the pixels are good, mean error {mean}"));
+            }
+        }
+        assert!(failed.is_empty(), "{}", failed.join("\n"));
+        let seen: u64 = self.tallies.values().map(|tally| tally.seen).sum();
+        assert!(seen > 0, "nothing is seen");
+    }
+
+    /// Prints a line for each pass of a form, or of all.
+    pub fn print(&self, of_form: &str) {
+        let mine = || self.tallies.iter().filter(|((form, _), _)| of_form.is_empty() || form == of_form);
+        for ((form, pass), t) in mine() {
+            println!(
+                "{form:18} {pass:24} {:4} pictures, {:9} pixels, {:8} seen, {:8.4} % good, mean {:.1e}, worst {:.1e} ({})",
+                t.pictures,
+                t.pixels,
+                t.seen,
+                100.0 * t.good as f64 / t.pixels as f64,
+                t.sum / t.pixels as f64,
+                t.worst,
+                t.worst_at
+            );
+        }
+        for ((form, pass), t) in mine() {
+            t.failed.iter().for_each(|failed| println!("FAILED {form}, {pass}, {failed}"));
+            t.left_out.iter().for_each(|at| println!("LEFT OUT {form}, {pass}, {at}"));
+        }
+    }
+}
+
+/// What of a volume is shown.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Part {
+    Density,
+    Depth,
+    Index,
+    FirstDensity,
+    Hits,
+    Steps(Filter),
+    Surface,
+    SurfaceHits,
+    March(Lookup),
+    Exact(Lookup),
+}
+
+pub const ALL_PARTS: [Part; 16] = [
+    Part::Density,
+    Part::Depth,
+    Part::Index,
+    Part::FirstDensity,
+    Part::Hits,
+    Part::Steps(Filter::Nearest),
+    Part::Steps(Filter::Trilinear),
+    Part::Surface,
+    Part::SurfaceHits,
+    Part::March(Lookup::Nearest),
+    Part::March(Lookup::Trilinear),
+    Part::March(Lookup::Tricubic),
+    Part::March(Lookup::StochasticTrilinear),
+    Part::March(Lookup::StochasticTricubic),
+    Part::Exact(Lookup::Nearest),
+    Part::Exact(Lookup::Trilinear),
+];
+
+/// A volume on both sides, in a form.
+pub struct Pair {
+    subject: String,
+    form: String,
+    channel: Channel,
+    volume: GpuVolume,
+    /// The level of its surface, if it is to be shown as one.
+    level: Option<f32>,
+    /// Whether it is packed with densities below 0, which are none, but in the bounds of what stands around them.
+    is_negative: bool,
+}
+
+/// A volume in a form; as a surface too, if it is a level set.
+pub fn pairs(gpu: &Gpu, subject: &Subject, form: &Form) -> Vec<Pair> {
+    let fog = pair(gpu, subject, form, false);
+    let surface = is_level_set(&subject.grid).then(|| pair(gpu, subject, form, true));
+    fog.into_iter().chain(surface.flatten()).collect()
+}
+
+fn pair(gpu: &Gpu, subject: &Subject, form: &Form, is_surface: bool) -> Option<Pair> {
+    let channel_of = |grid: Grid| match is_surface {
+        true => import_surface(grid).expect("a linear transform").0,
+        false => import(grid).expect("a linear transform").0,
+    };
+    let level = is_surface.then(|| import_surface(subject.grid.clone()).expect("a linear transform").1);
+    let report = import(subject.grid.clone()).expect("a linear transform").1;
+    let is_negative = form.options.is_some() && report.negative_values > 0;
+    let made = |channel, arrays: &Arrays| {
+        let volume = GpuVolume::new(gpu, arrays).expect("a volume");
+        Pair { subject: subject.name.clone(), form: form.name.clone(), channel, volume, level, is_negative }
+    };
+    let Some(options) = &form.options else {
+        let channel = channel_of(subject.grid.clone());
+        let arrays = Arrays::of_channels(&[&channel]).expect("arrays");
+        return Some(made(channel, &arrays));
+    };
+    let mut grid = subject.grid.clone();
+    let band = report.level_set_band;
+    grid.name = "shown".to_owned();
+    let asset = packed(&[vec![grid]], options);
+    let channel = unpacked_as(&asset, 0, "shown", channel_of)?;
+    let meaning = match (band, is_surface) {
+        (None, _) => Meaning::Density,
+        (Some(band), false) => Meaning::Fog { band },
+        (Some(band), true) => Meaning::Surface { band },
+    };
+    let wanted = [Wanted { name: "shown".to_owned(), meaning }];
+    let arrays = match Arrays::of_asset(&asset, &wanted, 0..1, form.bricks) {
+        // Refused, since shaders take it that nothing is where nothing stands.
+        Err(GpuError::Unsupported { feature }) if feature.contains("not empty") => return None,
+        arrays => arrays.expect("arrays"),
+    };
+    Some(made(channel, &arrays))
+}
+
+/// A volume in the light of a sun and an even sky, seen whole.
+fn scene_of(channel: &Channel) -> Option<Scene<'_>> {
+    let aspect = f64::from(SMALL[0]) / f64::from(SMALL[1]);
+    let world_box = WorldBox::of(channel)?;
+    let mut camera = fit_camera(world_box, DVec3::new(0.5, 0.35, 1.0), DVec3::Y, 35.0, aspect)?;
+    camera.half_width_tangent *= 0.75;
+    let extinction = fit_density_scale(channel, &camera, aspect).unwrap_or(1.0);
+    let volume = Volume {
+        albedo: [0.95, 0.9, 0.8],
+        phase: Phase::HenyeyGreenstein { g: 0.4 },
+        ..Volume::absorbing(Shape::Grid(channel), extinction)
+    };
+    let sun = Sun::point(glam::Vec3::new(0.48, 0.8, -0.36), [3.0, 2.8, 2.5]);
+    Some(Scene::of_one(camera, volume, Some(sun), [0.2, 0.3, 0.5]))
+}
+
+/// Holds what a part shows of a volume to what the CPU does.
+pub fn hold(matrix: &mut Matrix, renderer: &mut Renderer, pair: &Pair, part: Part) {
+    let Pair { subject: at, form, channel, volume, level, is_negative } = pair;
+    let is_of_surface = matches!(part, Part::Surface | Part::SurfaceHits);
+    if is_of_surface != level.is_some() {
+        return;
+    }
+    let name = format!("{part:?}");
+    if *is_negative && matches!(part, Part::March(_) | Part::Exact(_)) {
+        return matrix.left_out(form, &name, at, "where steps begin hangs on values below 0");
+    }
+    let (Some(scene), Some(field)) = (scene_of(channel), Field::new(channel)) else { return };
+    let look = Look::of_scene(&scene).expect("a look");
+    let extinction = scene.volumes[0].extinction[0];
+    let level = level.unwrap_or(0.0);
+    let few =
+        Quality { step_voxels: 1.5, shadow_step_voxels: 4.0, sun_rays: 6, sky_rays: 2, ..Quality::default() };
+    let exact = Quality { shadow_step_voxels: 0.0, sun_rays: 3, sky_rays: 0, ..few };
+    let pass = match part {
+        Part::Density => Pass::View(View::Density { extinction }),
+        Part::Depth => Pass::View(View::Depth),
+        Part::Index => Pass::View(View::Index),
+        Part::FirstDensity => Pass::View(View::FirstDensity),
+        Part::Hits => Pass::Hits { above: 0.0 },
+        Part::Steps(filter) => Pass::Opacity { filter, step_voxels: 0.5 },
+        Part::Surface => Pass::View(View::Surface { level }),
+        Part::SurfaceHits => Pass::SurfaceHits { level },
+        Part::March(lookup) if lookup.mean() == lookup => Pass::March(Quality { lookup, ..few }),
+        Part::March(lookup) => Pass::March(Quality { lookup, samples: 4, ..few }),
+        Part::Exact(lookup) => Pass::March(Quality { lookup, ..exact }),
+    };
+    renderer.prepare(volume, &look, &pass, 0, None).expect("a pass");
+    renderer.run(volume).expect("a run");
+    let ours = match renderer.pixels() {
+        Ok(pixels) => pixels,
+        Err(error) if error.to_string().contains("leaves loops") => {
+            return matrix.left_out(form, &name, at, "the driver leaves loops");
+        }
+        Err(error) => panic!("{error}"),
+    };
+    let rays = (0..PIXELS as u32).map(|i| {
+        let pixel = DVec2::new(f64::from(i % SMALL[0]), f64::from(i / SMALL[0])) + 0.5;
+        scene.camera.ray(pixel, SMALL[0], SMALL[1])
+    });
+    let mut reader = field.reader();
+    let count = |pixels: &[[f32; 4]]| pixels.iter().filter(|pixel| pixel[3] > 0.0).count();
+    match pass {
+        Pass::View(view) => {
+            let theirs =
+                render_view(&field, view, &scene.camera, SMALL, &|_, _| ()).expect("a picture").pixels;
+            match part {
+                Part::Density | Part::Surface => matrix.colours(form, &name, at, &ours, &theirs),
+                _ => matrix.hits(form, &name, at, &differences(&ours, &theirs), count(&theirs)),
+            }
+        }
+        Pass::Opacity { filter, step_voxels } => {
+            let theirs: Vec<[f32; 4]> = rays
+                .map(|ray| {
+                    let passes =
+                        stepped_transmittance(&field, &mut reader, &ray, filter, step_voxels, extinction);
+                    [1.0 - passes; 4]
+                })
+                .collect();
+            matrix.colours(form, &name, at, &ours, &theirs);
+        }
+        Pass::Hits { above } => {
+            let expected: Vec<_> = rays.map(|ray| first_voxel(&field, &mut reader, &ray, above)).collect();
+            let is_same = |(hit, expected): (&[f32; 4], &Option<VoxelHit>)| match expected {
+                None => hit[0] < 0.0,
+                Some(expected) => {
+                    let brick = IVec3::new(hit[1] as i32, hit[2] as i32, hit[3] as i32) >> 3;
+                    let is_near = (f64::from(hit[0]) / expected.distance - 1.0).abs() < 1e-5;
+                    brick == expected.voxel >> 3 && is_near
+                }
+            };
+            let errors: Vec<f64> =
+                ours.iter().zip(&expected).map(|pair| f64::from(u8::from(!is_same(pair)))).collect();
+            matrix.hits(form, &name, at, &errors, expected.iter().flatten().count());
+        }
+        Pass::SurfaceHits { level } => {
+            let expected: Vec<_> = rays.map(|ray| first_hit(&field, &mut reader, &ray, level)).collect();
+            let voxel = channel.world_from_index.matrix3.x_axis.length();
+            let is_same = |(hit, expected): (&[f32; 4], &Option<SurfaceHit>)| {
+                expected.map_or(hit[0] < 0.0, |expected| {
+                    (f64::from(hit[0]) - expected.distance).abs() < 0.01 * voxel
+                })
+            };
+            let errors: Vec<f64> =
+                ours.iter().zip(&expected).map(|pair| f64::from(u8::from(!is_same(pair)))).collect();
+            matrix.hits(form, &name, at, &errors, expected.iter().flatten().count());
+        }
+        Pass::March(quality) => {
+            let picture = nuage_render::picture::render(&scene, quality, SMALL[0], SMALL[1], &|_, _| ());
+            let theirs = picture.expect("a picture").pixels;
+            match quality.samples {
+                1 => matrix.colours(form, &name, at, &ours, &theirs),
+                _ => matrix.deviation(form, &name, at, standard_errors(&ours, &theirs), count(&theirs)),
+            }
+        }
+        _ => {}
+    }
+}
+
+/// By how many standard errors the means of two pictures differ at most. Which voxel is chosen hangs on the last bits of distances,
+/// so that pixels are off by chance: how much so they tell themselves.
+fn standard_errors(ours: &[[f32; 4]], theirs: &[[f32; 4]]) -> f64 {
+    let of_channel = |channel: usize| {
+        let off: Vec<f64> =
+            ours.iter().zip(theirs).map(|(a, b)| f64::from(a[channel] - b[channel])).collect();
+        let mean = off.iter().sum::<f64>() / off.len() as f64;
+        let variance = off.iter().map(|d| (d - mean).powi(2)).sum::<f64>() / off.len() as f64;
+        mean.abs() / (variance / off.len() as f64).sqrt().max(1e-5)
+    };
+    (0..4).map(of_channel).fold(0.0, f64::max)
+}
+
+impl Matrix {
+    /// Means may be off by some standard errors: of thousands, one by four and a half.
+    fn deviation(&mut self, form: &str, pass: &str, at: &str, errors: f64, seen: usize) {
+        let tally = self.tallies.entry((form.to_owned(), pass.to_owned())).or_default();
+        tally.pictures += 1;
+        tally.pixels += 1;
+        tally.good += u64::from(errors < 4.5);
+        tally.seen += seen as u64;
+        if errors > tally.worst {
+            (tally.worst, tally.worst_at) = (errors, at.to_owned());
+        }
+        if errors >= 4.5 {
+            tally.failed.push(format!("{at}: {errors:.1} standard errors"));
+        }
+    }
+
+    /// Of first hits five pixels in a thousand may differ.
+    fn hits(&mut self, form: &str, pass: &str, at: &str, errors: &[f64], seen: usize) {
+        let tally = self.tallies.entry((form.to_owned(), pass.to_owned())).or_default();
+        let bad = errors.iter().filter(|error| **error > 1.0 / 255.0).count();
+        tally.is_of_hits = true;
+        tally.pictures += 1;
+        tally.pixels += errors.len() as u64;
+        tally.good += (errors.len() - bad) as u64;
+        tally.seen += seen as u64;
+        if bad as f64 > 0.005 * errors.len() as f64 {
+            tally.failed.push(format!("{at}: {bad} of {} pixels meet something else", errors.len()));
+        }
+    }
+}

@@ -1,0 +1,220 @@
+//! Every volume, every form of bricks and every filter: pictures of the GPU held to those of the CPU.
+
+#![allow(clippy::print_stdout, reason = "the measured errors are worth reading")]
+
+mod common;
+
+use common::gpu;
+use std::time::Instant;
+
+use common::matrix::{ALL_PARTS, Form, Matrix, Pair, Part, SMALL, Subject, forms, hold, pairs, subjects};
+use nuage_gpu::device::Gpu;
+use nuage_gpu::renderer::Renderer;
+use nuage_render::filter::{Filter, Lookup};
+
+/// Files whose volumes are small and differ in kind.
+const SMALL_FILES: [&str; 23] = [
+    "oracle/oracle_64.vdb",
+    "data/samples/blast.0001.vdb",
+    "data/samples/blast.0008.vdb",
+    "data/samples/blast.0016.vdb",
+    "data/public/openusd_densityAndHeat.vdb",
+    "data/public/openusd_smoke_000002.vdb",
+    "data/public/arnoldusd_torus01.vdb",
+    "data/public/arnoldusd_grids.vdb",
+    "data/edge/background_nonzero.vdb",
+    "data/edge/comp_random_zip.vdb",
+    "data/edge/comp_seven_zipmask.vdb",
+    "data/edge/comp_sphere_zip.vdb",
+    "data/edge/cross_zero.vdb",
+    "data/edge/dense_constant_unpruned.vdb",
+    "data/edge/half_zip.vdb",
+    "data/edge/leaf_masks.vdb",
+    "data/edge/lower_tiles_only.vdb",
+    "data/edge/metadata_all.vdb",
+    "data/edge/py10_mixed.vdb",
+    "data/edge/single_voxel_m1.vdb",
+    "data/edge/transforms.vdb",
+    "data/edge/classes.vdb",
+    "data/edge/v12_sphere_half.vdb",
+];
+
+/// Files whose volumes reach far, so that loops on lavapipe may.
+const WIDE_FILES: [&str; 9] = [
+    "data/edge/empty_grid.vdb",
+    "data/edge/empty_grid_background.vdb",
+    "data/edge/far_coords.vdb",
+    "data/edge/many_root_children.vdb",
+    "data/edge/root_tiles_only.vdb",
+    "data/edge/single_voxel_far.vdb",
+    "data/edge/single_voxel_corner.vdb",
+    "data/edge/tiles_levels.vdb",
+    "data/edge/tiles_levels_bg_m1_none.vdb",
+];
+
+/// The same volumes as others in other files, and those of sequences.
+const LIKE_FILES: [&str; 40] = [
+    "data/public/openusd_smoke_000001.vdb",
+    "data/public/openusd_smoke_000003.vdb",
+    "data/sequences/chimney/fluid_data_0001.vdb",
+    "data/sequences/chimney/fluid_data_0050.vdb",
+    "data/sequences/chimney/fluid_data_0100.vdb",
+    "data/sequences/chimney_full/fluid_data_0001.vdb",
+    "data/sequences/chimney_full/fluid_data_0051.vdb",
+    "data/sequences/chimney_full/fluid_data_0100.vdb",
+    "data/sequences/explosion/fluid_data_0001.vdb",
+    "data/sequences/explosion/fluid_data_0025.vdb",
+    "data/sequences/explosion/fluid_data_0050.vdb",
+    "data/sequences/blender_variants/test40_f6_NONE_FULL.vdb",
+    "data/sequences/blender_variants/test40_f6_NONE_HALF.vdb",
+    "data/sequences/blender_variants/test40_f6_ZIP_FULL.vdb",
+    "data/sequences/blender_variants/test40_f6_ZIP_HALF.vdb",
+    "data/sequences/blender_variants/test40_f6_BLOSC_FULL.vdb",
+    "data/sequences/blender_variants/test40_f6_BLOSC_HALF.vdb",
+    "data/edge/background_nonzero_none.vdb",
+    "data/edge/comp_random_blosc.vdb",
+    "data/edge/comp_random_mask.vdb",
+    "data/edge/comp_random_none.vdb",
+    "data/edge/comp_random_zipmask.vdb",
+    "data/edge/comp_seven_blosc.vdb",
+    "data/edge/comp_seven_bloscmask.vdb",
+    "data/edge/comp_seven_mask.vdb",
+    "data/edge/comp_seven_none.vdb",
+    "data/edge/comp_sphere_blosc.vdb",
+    "data/edge/comp_sphere_bloscmask.vdb",
+    "data/edge/comp_sphere_mask.vdb",
+    "data/edge/comp_sphere_none.vdb",
+    "data/edge/comp_sphere_zipmask.vdb",
+    "data/edge/half_blosc.vdb",
+    "data/edge/half_bloscmask.vdb",
+    "data/edge/half_mask.vdb",
+    "data/edge/half_none.vdb",
+    "data/edge/leaf_masks_zip.vdb",
+    "data/edge/single_voxel_0.vdb",
+    "data/edge/transforms_none.vdb",
+    "data/edge/types_bloscmask.vdb",
+    "data/edge/tiles_levels_none.vdb",
+];
+
+/// Volumes that take seconds to be packed, the largest last.
+const LARGE_FILES: [&str; 8] = [
+    "data/public/gaffer_smoke.vdb",
+    "data/static/bunny_ls200_f16_zip.vdb",
+    "data/static/bunny_fog200_f32_zip.vdb",
+    "data/static/armadillo_fog300_f16_blosc.vdb",
+    "data/static/teapot_ls256_f16_none.vdb",
+    "data/edge/types_none.vdb",
+    "data/static/dragon_ls1000_f16_blosc.vdb",
+    "data/static/cumulus_half_f16_blosc.vdb",
+];
+
+/// Forms of which no two share a decoder, or the widths of codes in one.
+const UNLIKE_FORMS: [&str; 20] = [
+    "channel",
+    "f32",
+    "f16",
+    "u1",
+    "u4",
+    "u5",
+    "u8",
+    "s3",
+    "g0",
+    "g4",
+    "l2",
+    "bc4z",
+    "bc3y",
+    "bc7x",
+    "bc4x texture",
+    "bc3z texture",
+    "bc7y texture",
+    "u4 decoded",
+    "45 dB",
+    "error of 2 %",
+];
+
+struct Bench {
+    gpu: Gpu,
+    renderer: Renderer,
+    matrix: Matrix,
+    forms: Vec<Form>,
+}
+
+impl Bench {
+    fn new() -> Option<Bench> {
+        let gpu = gpu()?;
+        let renderer = Renderer::new(&gpu, SMALL).expect("a renderer");
+        let forms = forms(gpu.smallest_bricks().expect("a form"));
+        Some(Bench { gpu, renderer, matrix: Matrix::default(), forms })
+    }
+
+    /// Holds volumes in a form. Part after part: lavapipe takes seconds to make a shader, and forgets large ones.
+    fn hold(&mut self, form: usize, subjects: &[&Subject], parts: &[Part]) {
+        let pairs: Vec<Pair> =
+            subjects.iter().flat_map(|subject| pairs(&self.gpu, subject, &self.forms[form])).collect();
+        for part in parts {
+            for pair in &pairs {
+                hold(&mut self.matrix, &mut self.renderer, pair, *part);
+            }
+        }
+    }
+
+    fn named(&self, names: &[&str]) -> Vec<usize> {
+        (0..self.forms.len()).filter(|i| names.contains(&self.forms[*i].name.as_str())).collect()
+    }
+}
+
+/// All forms of the volumes that differ, by all filters: those that share a decoder with another of each third volume in turn,
+/// and large volumes and those that are like others in a form each, in turn. Prints what it found. `NUAGE_FORMS` names the forms
+/// that are wanted, with commas between them.
+#[test]
+#[ignore = "takes minutes for each form on a device in software"]
+fn the_whole_matrix_is_that_of_the_cpu() {
+    let Some(mut bench) = Bench::new() else { return };
+    let start = Instant::now();
+    let load = |files: &[&str]| -> Vec<Subject> { files.iter().flat_map(|file| subjects(file)).collect() };
+    let whole = load(&[&SMALL_FILES[..], &WIDE_FILES[..]].concat());
+    let in_turn = load(&[&LIKE_FILES[..], &LARGE_FILES[..]].concat());
+    let unlike = bench.named(&UNLIKE_FORMS);
+    let wanted = std::env::var("NUAGE_FORMS").unwrap_or_default();
+    for form in 0..bench.forms.len() {
+        if !wanted.is_empty() && !wanted.split(',').any(|name| name == bench.forms[form].name) {
+            continue;
+        }
+        let step = if unlike.contains(&form) { 1 } else { 3 };
+        let own = whole.iter().skip(form % step).step_by(step);
+        let others = in_turn.iter().skip(form).step_by(bench.forms.len());
+        let wrapped = in_turn.iter().enumerate().filter(|(i, _)| unlike.get(i % unlike.len()) == Some(&form));
+        let chosen: Vec<&Subject> = own.chain(others).chain(wrapped.map(|(_, subject)| subject)).collect();
+        bench.hold(form, &chosen, &ALL_PARTS);
+        println!(
+            "{}: {} volumes, {:.0} s",
+            bench.forms[form].name,
+            chosen.len(),
+            start.elapsed().as_secs_f32()
+        );
+        bench.matrix.print(&bench.forms[form].name);
+    }
+    bench.matrix.check();
+}
+
+/// One volume in all forms that differ, each other small or wide one in one of a few, and some by more filters: what is made
+/// soonest.
+#[test]
+fn a_turn_through_the_matrix_is_that_of_the_cpu() {
+    let Some(mut bench) = Bench::new() else { return };
+    let files = SMALL_FILES.iter().chain(&WIDE_FILES);
+    let all: Vec<Subject> = files.flat_map(|file| subjects(file)).collect();
+    // Textures and the other widths of codes have tests of their own.
+    for form in bench.named(&["channel", "f32", "u5", "s3", "g4", "l2", "bc4z", "bc3y", "bc7x", "45 dB"]) {
+        bench.hold(form, &[&all[0]], &[Part::Density]);
+    }
+    let few = bench.named(&["f16", "u4"]);
+    for (i, form) in few.iter().enumerate() {
+        let chosen: Vec<&Subject> = all.iter().skip(i).step_by(few.len()).collect();
+        bench.hold(*form, &chosen, &[Part::Density, Part::Hits]);
+    }
+    let chosen: Vec<&Subject> = all.iter().step_by(4).collect();
+    bench.hold(few[0], &chosen, &[Part::Steps(Filter::Nearest), Part::March(Lookup::Trilinear)]);
+    bench.matrix.print("");
+    bench.matrix.check();
+}
