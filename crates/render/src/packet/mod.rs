@@ -363,13 +363,6 @@ impl<'m, S: Simd> Lanes<'m, S> {
         Step { t: leaving.t, behind: self.behind(&leaving, voxels) }
     }
 
-    /// Where rays leave the bricks they are in, or as many empty ones as there are.
-    #[inline(always)]
-    fn leave_bricks(&self, bricks: [f32x16<S>; 3], beyond: f32x16<S>, t: f32x16<S>) -> f32x16<S> {
-        let faces = self.faces(bricks, beyond);
-        self.leave([faces[0] * 8.0, faces[1] * 8.0, faces[2] * 8.0], t).t
-    }
-
     /// How rays leave the bricks they are in, or as many empty ones as there are, and the bricks behind.
     #[inline(always)]
     fn step_bricks(&self, bricks: [f32x16<S>; 3], beyond: f32x16<S>, t: f32x16<S>) -> Step<S> {
