@@ -32,6 +32,8 @@ const RESOLUTIONS: [i32; 4] = [128, 256, 512, 1024];
 /// The sides of the picture, and of the tiles in which it is made.
 const SIZE: u32 = 1024;
 const TILE: u32 = 16;
+/// Tiles follow each other down, so many, and then to the right, as the renderer makes them.
+const BAND: u32 = 4;
 /// Of the rays in no order one in so many is timed.
 const SHUFFLED_PART: usize = 16;
 /// The cycles of a multiplication and of an exclusive or on the processors of the last decade.
@@ -173,10 +175,12 @@ fn picture_rays(side: u32) -> Result<Vec<Ray>, Box<dyn Error>> {
     let middle = DVec3::splat(0.5 * WIDTH);
     let camera = Camera::look_at(middle + DVec3::new(0.9, 0.5, 1.4) * WIDTH, middle, DVec3::Y, 40.0)
         .ok_or("no view")?;
-    let columns = side / TILE;
+    let (columns, rows) = (side / TILE, side / TILE);
     let pixel = |i: u32| {
         let (tile, i) = (i / (TILE * TILE), i % (TILE * TILE));
-        let (left, top) = (tile % columns * TILE, tile / columns * TILE);
+        let (band, tile) = (tile / (columns * BAND), tile % (columns * BAND));
+        let down = BAND.min(rows - band * BAND);
+        let (left, top) = (tile / down * TILE, (band * BAND + tile % down) * TILE);
         let packet = i / RAYS as u32;
         let (left, top) = (left + packet % (TILE / SIDE) * SIDE, top + packet / (TILE / SIDE) * SIDE);
         let [x, y] = square(left, top)[i as usize % RAYS];

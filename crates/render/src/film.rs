@@ -299,6 +299,10 @@ impl Film {
 /// Pixels per side of a tile, the unit of work of a thread.
 const TILE: u32 = 16;
 
+/// Tiles follow each other down, so many, and then to the right: what rays of one have read is still near when its neighbours
+/// read it.
+const BAND: u32 = 4;
+
 /// How a picture is cut into tiles, which are numbered row by row.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Tiling {
@@ -314,8 +318,10 @@ impl Tiling {
 
     /// Column and row of each pixel of a tile, row by row.
     pub(crate) fn pixels(self, tile: u32) -> impl Iterator<Item = [u32; 2]> {
-        let columns = self.width.div_ceil(TILE);
-        let [left, top] = [tile % columns * TILE, tile / columns * TILE];
+        let [columns, rows] = [self.width.div_ceil(TILE), self.height.div_ceil(TILE)];
+        let (band, tile) = (tile / (columns * BAND), tile % (columns * BAND));
+        let down = BAND.min(rows - band * BAND);
+        let [left, top] = [tile / down * TILE, (band * BAND + tile % down) * TILE];
         let [across, down] = [TILE.min(self.width - left), TILE.min(self.height - top)];
         (0..across * down).map(move |i| [left + i % across, top + i / across])
     }
