@@ -27,8 +27,12 @@ use crate::maps;
 use crate::params::{Field, Place};
 use crate::shader::{HEADER_WORDS, codec_bit};
 
-/// Maps of bricks take at most this part of the bytes of trees and bricks: a look-up is then worth its memory.
+/// Maps of bricks take at most this part of the bytes of trees and bricks: a look-up is then worth its memory, …
 const MAP_SHARE: usize = 8;
+/// … or so many bytes, which no device misses, …
+const SMALL_MAP_BYTES: usize = 4 << 20;
+/// … and with trees no more than any device binds.
+const MAX_TREE_BYTES: usize = 128 << 20;
 
 /// In which form bricks are kept on the device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -96,7 +100,9 @@ pub struct Arrays {
     channels: usize,
     codecs: u32,
     origin: DVec3,
-    /// Flat maps of bricks, and where that of each place begins; empty if they would be large beside the rest.
+    /// Whether there are flat maps of bricks: not if they would be large beside the rest.
+    has_maps: bool,
+    /// These, and where that of each place begins.
     maps: Vec<u32>,
     first_map_words: Vec<u32>,
 }
@@ -195,7 +201,7 @@ impl Arrays {
         }
         arrays.trees = packer.finish();
         arrays.settle();
-        arrays.make_maps();
+        arrays.make_maps_where_worth();
         Ok(arrays)
     }
 
@@ -211,10 +217,22 @@ impl Arrays {
         frames: Range<usize>,
         form: Bricks,
     ) -> Result<Arrays, GpuError> {
-        Arrays::default().with(asset, wanted, frames, form)
+        let mut arrays = Arrays::default().with(asset, wanted, frames, form)?;
+        arrays.make_maps_where_worth();
+        Ok(arrays)
     }
 
-    /// As [`Arrays::of_asset`], with zeros in place of the words of bricks, whose pages need not be loaded.
+    /// The words of one frame that is to take others' place: without maps until [`Arrays::agree_with`] makes them.
+    pub(crate) fn of_frame(
+        asset: &Asset,
+        wanted: &[Wanted],
+        frame: usize,
+        form: Bricks,
+    ) -> Result<Arrays, GpuError> {
+        Arrays::default().with(asset, wanted, frame..frame + 1, form)
+    }
+
+    /// As [`Arrays::of_frame`], with zeros in place of the words of bricks, whose pages need not be loaded.
     pub(crate) fn room_of(
         asset: &Asset,
         wanted: &[Wanted],
@@ -266,7 +284,6 @@ impl Arrays {
             }
         }
         arrays.settle();
-        arrays.make_maps();
         Ok(arrays)
     }
 
@@ -511,19 +528,23 @@ impl Arrays {
         self.origin = if middle.is_finite() { middle } else { DVec3::ZERO };
     }
 
-    /// Makes maps of all places, unless they take more than a part of what stands there already.
-    fn make_maps(&mut self) {
-        // Of trees whose bricks are not there, the size alone is wanted.
-        if self.is_room {
-            return;
-        }
+    /// Makes maps of all places, unless they are large beside what stands there already.
+    fn make_maps_where_worth(&mut self) {
         let [trees, bricks] = self.size_bytes();
-        let boxes: Vec<[IVec3; 2]> = self.places.iter().flatten().map(Place::bricks).collect();
-        let counts = boxes.iter().map(|[first, last]| maps::cell_count(*first, *last));
-        let cells = counts.sum::<Option<usize>>().and_then(|count| count.checked_mul(4 * maps::CELL_WORDS));
-        if cells.is_none_or(|bytes| bytes > (trees + bricks) / MAP_SHARE) {
-            return;
+        if self.map_words().is_some_and(|words| are_maps_worth(4 * words, trees, bricks)) {
+            self.make_maps();
         }
+    }
+
+    /// The words of a map of each place. `None` if they are too many to be had.
+    pub(crate) fn map_words(&self) -> Option<usize> {
+        let boxes = self.places.iter().flatten().map(Place::bricks);
+        let cells: Option<usize> = boxes.map(|[first, last]| maps::cell_count(first, last)).sum();
+        cells?.checked_mul(maps::CELL_WORDS)
+    }
+
+    /// Makes maps of all places.
+    fn make_maps(&mut self) {
         // Frames of the same tree share a map.
         let mut known: HashMap<([u32; 2], [IVec3; 2]), u32> = HashMap::new();
         let mut words = Vec::new();
@@ -547,7 +568,7 @@ impl Arrays {
             };
             firsts.push(first);
         }
-        (self.maps, self.first_map_words) = (words, firsts);
+        (self.has_maps, self.maps, self.first_map_words) = (true, words, firsts);
     }
 
     /// Whether all values mean themselves.
@@ -557,16 +578,17 @@ impl Arrays {
 
     /// Whether all fields have a map.
     pub(crate) fn has_maps(&self) -> bool {
-        !self.maps.is_empty()
+        self.has_maps
     }
 
-    /// Takes other frames for what is to be the same for all: their origin, their codecs, and their largest values.
+    /// Takes other frames for what is to be the same for all: their origin, their codecs, their largest values, and whether there
+    /// are maps.
     pub(crate) fn agree_with(&mut self, other: &Arrays) {
         self.origin = other.origin;
         self.codecs |= other.codecs;
-        // Frames that take each other's place have room for trees alone.
-        self.maps.clear();
-        self.first_map_words.clear();
+        if other.has_maps && !self.has_maps {
+            self.make_maps();
+        }
         for (largest, other) in self.largest.iter_mut().zip(&other.largest) {
             *largest = largest.max(*other);
         }
@@ -579,6 +601,11 @@ impl Arrays {
         self.largest.resize(other.largest.len(), 0.0);
         self.agree_with(other);
         self.settle();
+    }
+
+    /// Says that frames that agree with these have maps.
+    pub(crate) fn set_maps(&mut self) {
+        self.has_maps = true;
     }
 
     /// How many channels each frame has.
@@ -676,6 +703,11 @@ impl Arrays {
     pub(crate) fn brick_words(&self) -> [&[u32]; 2] {
         [&self.words, &self.shapes]
     }
+}
+
+/// Whether maps are worth their bytes beside trees and bricks.
+pub(crate) fn are_maps_worth(maps: usize, trees: usize, bricks: usize) -> bool {
+    maps <= SMALL_MAP_BYTES.max((trees + bricks) / MAP_SHARE) && trees + maps <= MAX_TREE_BYTES
 }
 
 fn place_of(

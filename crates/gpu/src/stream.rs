@@ -9,7 +9,7 @@
 
 use nuage_volume::format::Asset;
 
-use crate::arrays::{Arrays, Bricks, Room, Wanted};
+use crate::arrays::{Arrays, Bricks, Room, Wanted, are_maps_worth};
 use crate::device::Gpu;
 use crate::error::GpuError;
 use crate::upload::Volume;
@@ -53,11 +53,19 @@ impl Stream {
     ) -> Result<Stream, GpuError> {
         let mut common = Arrays::default();
         let mut room = Room::default();
+        let mut map_words = Some(0);
         let frames = asset.contents().frames.len();
         for frame in 0..frames {
             let arrays = Arrays::room_of(asset, wanted, frame, form)?;
             room = room.max(arrays.room());
+            map_words = map_words.zip(arrays.map_words()).map(|(most, words)| most.max(words));
             common.append_places(&arrays);
+        }
+        // What is the same for all: maps, or none.
+        let [trees, bricks] = [room.tree_words, room.brick_words].map(|words| 4 * words);
+        if let Some(words) = map_words.filter(|words| are_maps_worth(4 * words, trees, bricks)) {
+            room.tree_words += words;
+            common.set_maps();
         }
         let size_bytes = Volume::size_of(gpu, room)?.total();
         let count = usize::try_from(budget_bytes / size_bytes).unwrap_or(usize::MAX).min(frames);
@@ -82,7 +90,7 @@ impl Stream {
         let slot = there.unwrap_or_else(oldest);
         let slot = &mut self.slots[slot];
         if there.is_none() {
-            let mut arrays = Arrays::of_asset(asset, &self.wanted, frame..frame + 1, self.form)?;
+            let mut arrays = Arrays::of_frame(asset, &self.wanted, frame, self.form)?;
             arrays.agree_with(&self.common);
             // Whatever fails on the way leaves nothing that could be taken for a frame.
             slot.frame = None;

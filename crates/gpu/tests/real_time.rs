@@ -193,7 +193,9 @@ fn accumulated_pictures_converge() {
             println!(
                 "half {half_resolution}: deviation {before:.2e} of the first, {after:.2e} and mean {mean:.2e} of the last"
             );
-            assert!(after < 0.4 * before, "{before} {after}");
+            // What is finer than the pixels that are marched does not come back as noise goes.
+            let part = if half_resolution { 0.45 } else { 0.35 };
+            assert!(after < part * before, "{before} {after}");
         }
     });
 }

@@ -33,6 +33,25 @@ fn next_step(steps: ptr<function, Steps>) -> vec2<f32> {
 // Steps that are lit together: what they scatter of the camera's light, the same times t, and where they begin.
 struct Group { share: f32, moment: f32, start: f32 }
 
+// Steps that are lit together by one ray to the sky: what they scatter of the camera's light, where the ray begins, and the
+// random number that decides whether it begins in the next step instead.
+struct SkyGroup { share: f32, t: f32, random: f32 }
+
+// Takes a step into a group, from a place of which the ray begins with the probability of its part of the share: so that a group
+// of any size is worth what it scatters, where as many rays as are due would be none in most of what is thin.
+fn with_step(group: SkyGroup, step: vec2<f32>, share: f32) -> SkyGroup {
+    let sum = group.share + share;
+    if (share <= 0.0) {
+        return group;
+    }
+    let part = share / sum;
+    if (group.random < part) {
+        let within = group.random / part;
+        return SkyGroup(sum, step.x + within * (step.y - step.x), within);
+    }
+    return SkyGroup(sum, group.t, (group.random - part) / (1.0 - part));
+}
+
 // How far a camera ray has got: what is kept while a shadow ray is followed. All else is made anew from the pixel, so that
 // registers are free for the shadow ray.
 struct Progress {
@@ -57,6 +76,7 @@ struct Progress {
     taken: f32,
     next_sky: f32,
     sky_index: u32,
+    sky: SkyGroup,
     transmittance: f32,
     // Sums over all rays of the pixel: light, and the distances of steps, each times the share that it took.
     scattered: vec3<f32>,
@@ -113,6 +133,7 @@ fn next_shadow_ray(progress: ptr<function, Progress>, ray: Ray, max_distance: f3
         begun.depth_moment = before.depth_moment;
         begun.transmittance = 1.0;
         begun.next_sky = sky_shift(random, shift) / max(params.march_rays.y, 1.0);
+        begun.sky.random = sky_shift(random, shift);
         let span = density_span - start;
         let runs = runs_between(density, local, span.x, select(span.x, span.y, has_density));
         begun.brick = runs.brick;
@@ -135,10 +156,15 @@ fn next_shadow_ray(progress: ptr<function, Progress>, ray: Ray, max_distance: f3
     var runs = Runs(density, local, now.brick, now.t, now.t_end, MAX_ROOT_LEAPS, MAX_LEAPS);
     var glow_runs = Runs(glow, glow_local, now.glow_brick, now.glow_t, now.glow_t_end, MAX_ROOT_LEAPS, MAX_LEAPS);
     let full = 1.0 / params.march_rays.x;
+    let full_sky = 1.0 / max(params.march_rays.y, 1.0);
     var t = 0.0;
     loop {
         var is_over = false;
-        if (now.lit >= now.step.y && !(has_sky && now.taken + now.share > now.next_sky)) {
+        var is_sky_due = has_sky && now.taken + now.share > now.next_sky;
+        if (GROUPS_SKY) {
+            is_sky_due = now.sky.share >= full_sky;
+        }
+        if (now.lit >= now.step.y && !is_sky_due) {
             // The next step, of the runs of both channels, cut where either begins or ends.
             now.taken += now.share;
             now.share = 0.0;
@@ -198,6 +224,9 @@ fn next_shadow_ray(progress: ptr<function, Progress>, ray: Ray, max_distance: f3
                 now.step = vec2<f32>(t0, end);
                 now.share = now.transmittance * absorbed;
                 now.lit = select(end, t0, has_sun && now.share > 0.0);
+                if (GROUPS_SKY && has_sky) {
+                    now.sky = with_step(now.sky, now.step, now.share);
+                }
                 now.depth_moment += now.share * (start + middle);
                 now.transmittance *= 1.0 - absorbed;
             }
@@ -233,10 +262,21 @@ fn next_shadow_ray(progress: ptr<function, Progress>, ray: Ray, max_distance: f3
                 let sun = params.sun_irradiance.xyz * params.media[0].albedo.xyz;
                 now.scattered += sun * (found.worth * cached_transmittance(ray_at(shadow_local, t)));
             }
-            if (is_over) {
+            if (is_over && !(GROUPS_SKY && now.sky.share > 0.0)) {
                 break;
             }
-        } else if (has_sky && now.taken + now.share > now.next_sky) {
+        }
+        if (GROUPS_SKY) {
+            if (now.sky.share > 0.0 && (is_over || (now.lit >= now.step.y && now.sky.share >= full_sky))) {
+                t = now.sky.t;
+                found.worth = now.sky.share;
+                found.is_there = true;
+                found.is_to_sky = true;
+                now.sky.share = 0.0;
+                now.sky_index += 1u;
+                break;
+            }
+        } else if (now.lit >= now.step.y && has_sky && now.taken + now.share > now.next_sky) {
             let part = clamp((now.next_sky - now.taken) / now.share, 0.0, 1.0);
             t = now.step.x + part * (now.step.y - now.step.x);
             now.next_sky += 1.0 / params.march_rays.y;

@@ -6,6 +6,9 @@
 @group(3) @binding(2) var blue_noise: texture_2d<f32>;
 @group(3) @binding(3) var depth_of_marched: texture_storage_2d<r32float, write>;
 
+// Whether steps are lit by the sky in groups, of any size: less noise, of one ray each at least.
+const GROUPS_SKY: bool = true;
+
 // Where the steps of a pixel begin: neighbours differ as much as they can, and so do pictures that follow each other.
 fn step_shift(marched: vec2<u32>, random: u32) -> f32 {
     let noise = textureLoad(blue_noise, marched % NOISE_SIDE, 0).x;

@@ -1,5 +1,8 @@
 // What pictures that stand alone do in place of `real_time.wgsl`.
 
+// Whether steps are lit by the sky in groups, of any size: less noise, of one ray each at least.
+const GROUPS_SKY: bool = false;
+
 fn step_shift(marched: vec2<u32>, random: u32) -> f32 {
     return unit_f32(hash_u32(random));
 }
