@@ -16,9 +16,10 @@ use std::hint::black_box;
 use glam::{DAffine3, DVec2, DVec3, IVec3, Vec3};
 use half::f16;
 use nuage_render::camera::{Camera, Ray};
+use nuage_render::film::Tiling;
 use nuage_render::filter::Filter;
 use nuage_render::hash::{hash_u32, unit_f32};
-use nuage_render::packet::{RAYS, SIDE, first_collisions, optical_depths, square, stepped_transmittances};
+use nuage_render::packet::{RAYS, SIDE, first_collisions, optical_depths, stepped_transmittances};
 use nuage_render::traverse::{Field, Reader};
 use nuage_testkit::clock::processor_ms;
 use nuage_volume::accessor::Accessor;
@@ -29,11 +30,8 @@ use nuage_volume::space::BRICK_VOXELS;
 use rayon::prelude::*;
 
 const RESOLUTIONS: [i32; 4] = [128, 256, 512, 1024];
-/// The sides of the picture, and of the tiles in which it is made.
+/// The sides of the picture.
 const SIZE: u32 = 1024;
-const TILE: u32 = 16;
-/// Tiles follow each other down, so many, and then to the right, as the renderer makes them.
-const BAND: u32 = 4;
 /// Of the rays in no order one in so many is timed.
 const SHUFFLED_PART: usize = 16;
 /// The cycles of a multiplication and of an exclusive or on the processors of the last decade.
@@ -170,23 +168,15 @@ fn ray_ns<'a>(kernel: &str, field: &Field<'a>, rays: &[Ray]) -> f64 {
     median((0..ROUNDS).map(|_| ns_of(passes)).collect()) / rays.len() as f64
 }
 
-/// The rays of a picture of so many pixels across, tile by tile as the renderer makes it.
+/// The rays of a picture of so many pixels across, a multiple of a packet's, tile by tile as the renderer makes it.
 fn picture_rays(side: u32) -> Result<Vec<Ray>, Box<dyn Error>> {
     let middle = DVec3::splat(0.5 * WIDTH);
     let camera = Camera::look_at(middle + DVec3::new(0.9, 0.5, 1.4) * WIDTH, middle, DVec3::Y, 40.0)
         .ok_or("no view")?;
-    let (columns, rows) = (side / TILE, side / TILE);
-    let pixel = |i: u32| {
-        let (tile, i) = (i / (TILE * TILE), i % (TILE * TILE));
-        let (band, tile) = (tile / (columns * BAND), tile % (columns * BAND));
-        let down = BAND.min(rows - band * BAND);
-        let (left, top) = (tile / down * TILE, (band * BAND + tile % down) * TILE);
-        let packet = i / RAYS as u32;
-        let (left, top) = (left + packet % (TILE / SIDE) * SIDE, top + packet / (TILE / SIDE) * SIDE);
-        let [x, y] = square(left, top)[i as usize % RAYS];
-        DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5)
-    };
-    Ok((0..side * side).map(|i| camera.ray(pixel(i), side, side)).collect())
+    let tiling = Tiling { width: side, height: side };
+    let pixels = (0..tiling.count()).flat_map(|tile| tiling.squares(tile)).flatten();
+    let place = |[x, y]: [u32; 2]| DVec2::new(f64::from(x), f64::from(y)) + 0.5;
+    Ok(pixels.map(|pixel| camera.ray(place(pixel), side, side)).collect())
 }
 
 /// Some of them in an order that no cache knows.
@@ -265,7 +255,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         let channel = cloud(*resolution)?;
         let field = Field::new(&channel).ok_or("no cloud")?;
         // A picture of as many pixels across as the cloud has voxels: rays lie as far apart at every resolution.
-        let apart = picture_rays(resolution.unsigned_abs().next_multiple_of(TILE))?;
+        let apart = picture_rays(resolution.unsigned_abs().next_multiple_of(SIDE))?;
         let mut accessor = Accessor::new(&channel.tree);
         let mut sums = [0.0; 3];
         for ray in &rays {

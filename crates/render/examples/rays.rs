@@ -13,10 +13,11 @@ use std::time::Instant;
 use glam::{DVec2, DVec3, IVec3, Vec3};
 use nuage_pipeline::import::{import, import_surface};
 use nuage_render::camera::{Camera, Ray};
+use nuage_render::film::Tiling;
 use nuage_render::filter::Filter;
 use nuage_render::hash::{hash_pixel, hash_u32, unit_f32};
 use nuage_render::packet::{
-    RAYS, SIDE, Surface, first_collisions, first_voxels, optical_depths, square, stepped_transmittances,
+    RAYS, Surface, first_collisions, first_voxels, optical_depths, stepped_transmittances,
 };
 use nuage_render::traverse::{Field, Reader};
 use nuage_testkit::clock::processor_ms;
@@ -26,7 +27,6 @@ use rayon::prelude::*;
 /// Per voxel at density 1.
 const EXTINCTION_PER_VOXEL: f64 = 0.1;
 const STEP_VOXELS: f32 = 0.5;
-const TILE: u32 = 16;
 
 /// The channel of a file's first grid, and the value at its surface if it is a level set that is to be drawn.
 fn channel(path: &str, is_surface: bool) -> Result<(Channel, f32), Box<dyn Error>> {
@@ -39,26 +39,19 @@ fn channel(path: &str, is_surface: bool) -> Result<(Channel, f32), Box<dyn Error
     })
 }
 
-/// The values of a tile, packet by packet.
-type Tile = [f32; (TILE * TILE) as usize];
-
-/// The pixels of a packet of a tile.
-fn pixels_of(tile: u32, packet: u32, size: u32) -> [[u32; 2]; RAYS] {
-    let columns = size.div_ceil(TILE);
-    let (left, top) = (tile % columns * TILE, tile / columns * TILE);
-    let across = TILE / SIDE;
-    square(left + packet % across * SIDE, top + packet / across * SIDE)
-}
-
-/// Makes the tiles of a picture. Gives how many milliseconds it took.
-fn picture<'a>(field: &Field<'a>, size: u32, kernel: &Kernel<'_, 'a>, tiles: &mut [Tile]) -> f64 {
+/// Makes the tiles of a picture, packet by packet. Gives how many milliseconds it took.
+fn picture<'a>(
+    field: &Field<'a>,
+    tiling: Tiling,
+    kernel: &Kernel<'_, 'a>,
+    tiles: &mut [Vec<[f32; RAYS]>],
+) -> f64 {
     let begin = Instant::now();
     tiles.par_iter_mut().enumerate().for_each_init(
         || field.reader(),
         |reader, (tile, values)| {
-            for (packet, values) in (0..).zip(values.as_chunks_mut().0) {
-                *values = kernel(reader, pixels_of(tile as u32, packet, size));
-            }
+            values.clear();
+            values.extend(tiling.squares(tile as u32).map(|pixels| kernel(reader, pixels)));
         },
     );
     begin.elapsed().as_secs_f64() * 1e3
@@ -167,10 +160,11 @@ fn main() -> Result<(), Box<dyn Error>> {
     let kernel = kernel_of(kernel, &field, rays, extinction, voxel_size, level, seed)?;
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads.parse()?).build()?;
     let (mut times, mut cpu_times) = (Vec::new(), Vec::new());
-    let mut tiles = vec![[0.0; (TILE * TILE) as usize]; size.div_ceil(TILE).pow(2) as usize];
+    let tiling = Tiling { width: size, height: size };
+    let mut tiles = vec![Vec::new(); tiling.count() as usize];
     for turn in 0..=repeats {
         let cpu = processor_ms();
-        let time = pool.install(|| picture(&field, size, &kernel, &mut tiles));
+        let time = pool.install(|| picture(&field, tiling, &kernel, &mut tiles));
         if turn > 0 {
             times.push(time);
             cpu_times.push(processor_ms() - cpu);
@@ -181,12 +175,10 @@ fn main() -> Result<(), Box<dyn Error>> {
     }
     let mut values = vec![0.0_f32; size as usize * size as usize];
     for (tile, tile_values) in (0..).zip(&tiles) {
-        for (packet, packet_values) in (0..).zip(tile_values.as_chunks::<RAYS>().0) {
-            for ([x, y], value) in pixels_of(tile, packet, size).into_iter().zip(packet_values) {
-                // Tiles may reach over the edge.
-                if x < size && y < size {
-                    values[(y * size + x) as usize] = *value;
-                }
+        for ([x, y], value) in tiling.squares(tile).flatten().zip(tile_values.as_flattened()) {
+            // Packets may reach over the edge.
+            if x < size && y < size {
+                values[(y * size + x) as usize] = *value;
             }
         }
     }

@@ -9,11 +9,12 @@
 
 use std::sync::{Arc, OnceLock};
 
-use crate::gather::prefetch;
 use glam::{IVec3, Vec3};
 use nuage_volume::accessor::{Accessor, BrickPlace};
 use nuage_volume::space::brick_of;
 use nuage_volume::tree::{Content, Tree};
+
+use crate::gather::prefetch;
 
 /// Voxels of a block per axis.
 pub(crate) const SIDE: usize = 9;

@@ -5,6 +5,7 @@
 
 use glam::Vec3;
 
+use crate::packet::{RAYS, SIDE, square};
 use crate::path::PathSample;
 
 /// The most pixels that one [`Image`] may have: 8192 x 8192, one gibibyte.
@@ -303,16 +304,18 @@ const TILE: u32 = 16;
 /// read it.
 const BAND: u32 = 4;
 
-/// How a picture is cut into tiles, which are numbered row by row.
+/// How a picture is cut into tiles, and in which order they are made.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Tiling {
-    pub(crate) width: u32,
-    pub(crate) height: u32,
+pub struct Tiling {
+    /// The width of the picture, in pixels.
+    pub width: u32,
+    /// The height of the picture, in pixels.
+    pub height: u32,
 }
 
 impl Tiling {
     /// How many tiles there are.
-    pub(crate) fn count(self) -> u32 {
+    pub fn count(self) -> u32 {
         self.width.div_ceil(TILE) * self.height.div_ceil(TILE)
     }
 
@@ -324,6 +327,15 @@ impl Tiling {
         let [left, top] = [tile / down * TILE, (band * BAND + tile % down) * TILE];
         let [across, down] = [TILE.min(self.width - left), TILE.min(self.height - top)];
         (0..across * down).map(move |i| [left + i % across, top + i / across])
+    }
+
+    /// The squares of a tile whose rays make packets. Those at the right and at the bottom may reach beyond the picture.
+    ///
+    /// # Panics
+    /// If there is no such tile.
+    pub fn squares(self, tile: u32) -> impl Iterator<Item = [[u32; 2]; RAYS]> {
+        let corners = self.pixels(tile).filter(|pixel| pixel.iter().all(|at| at % SIDE == 0));
+        corners.map(|[left, top]| square(left, top))
     }
 
     /// The pixels of the whole picture, row by row, from those of all tiles.

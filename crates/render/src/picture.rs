@@ -10,7 +10,7 @@ use glam::DVec2;
 use crate::film::{Image, ImageSizeError, Tiling};
 use crate::hash::{PLASTIC_STEPS, hash_pixel, unit_f32};
 use crate::march::{Marcher, Quality, Worker};
-use crate::packet::{RAYS, SIDE, square};
+use crate::packet::RAYS;
 use crate::scene::Scene;
 
 /// Renders a scene by marching. The picture's alpha is 1 − transmittance; nothing stands behind the medium
@@ -76,8 +76,7 @@ pub(crate) fn each_packet<W>(
     let mut tiles = vec![Vec::new(); tiling.count() as usize];
     let done = AtomicU32::new(0);
     each_tile(&mut tiles, worker, |worker, index, tile: &mut Vec<([u32; 2], [f32; 4])>| {
-        for [left, top] in tiling.pixels(index).filter(|pixel| pixel.iter().all(|at| at % SIDE == 0)) {
-            let pixels = square(left, top);
+        for pixels in tiling.squares(index) {
             tile.extend(pixels.into_iter().zip(packet(worker, &pixels)));
         }
         progress(done.fetch_add(1, Ordering::Relaxed) + 1, tiling.count());

@@ -8,6 +8,7 @@ use fearless_simd::{Simd, i32x16, prelude::*};
 use nuage_volume::space::BRICK_VOXELS;
 
 use super::RAYS;
+use crate::blocks::Blocks;
 use crate::gather::prefetch;
 use crate::walk::SPECIAL;
 
@@ -39,35 +40,26 @@ impl<T: Copy, const TURNS: usize> Late<T, TURNS> {
     }
 }
 
-/// Which bricks rays have been in when they were asked for, of which one is chosen each `TURNS` turns.
+/// The bricks rays were in when those were last chosen to be asked for, by ray.
 ///
-/// That is done whether one is new or not: what rays enter next cannot be told, so that a branch would cost more than lines that
+/// One is chosen whether it is new or not: what rays enter next cannot be told, so that a branch would cost more than lines that
 /// are asked for twice.
-pub(super) struct Asked<S: Simd, const TURNS: usize> {
-    /// By ray, the brick it was in when that was last chosen.
-    known: i32x16<S>,
-    chosen: usize,
-    turn: usize,
-}
+pub(super) struct Asked<S: Simd>(i32x16<S>);
 
-impl<S: Simd, const TURNS: usize> Asked<S, TURNS> {
+impl<S: Simd> Asked<S> {
     #[inline(always)]
     pub(super) fn new(simd: S) -> Self {
-        Asked { known: i32x16::splat(simd, -1), chosen: 0, turn: 0 }
+        Asked(i32x16::splat(simd, -1))
     }
 
-    /// Calls with a brick in which rays are, or were some turns ago, and with the number of turns since then.
+    /// A brick in which rays are, one they have entered since it was last chosen if there is one; any where they are in none.
     #[inline(always)]
-    pub(super) fn enter(&mut self, simd: S, cells: i32x16<S>, mut ask: impl FnMut(usize, usize)) {
-        if self.turn == 0 {
-            let new = cells.simd_ge(0) & cells.simd_lt(SPECIAL) & !cells.simd_eq(self.known);
-            let first = new.to_bitmask().trailing_zeros() as usize % RAYS;
-            let brick = cells.to_array()[first];
-            self.known = cells.simd_eq(i32x16::splat(simd, brick)).select(cells, self.known);
-            self.chosen = brick.max(0) as usize;
-        }
-        ask(self.chosen, self.turn);
-        self.turn = (self.turn + 1) % TURNS;
+    pub(super) fn choose(&mut self, simd: S, cells: i32x16<S>) -> usize {
+        let new = cells.simd_ge(0) & cells.simd_lt(SPECIAL) & !cells.simd_eq(self.0);
+        let first = new.to_bitmask().trailing_zeros() as usize % RAYS;
+        let brick = cells.to_array()[first];
+        self.0 = cells.simd_eq(i32x16::splat(simd, brick)).select(cells, self.0);
+        brick.max(0) as usize
     }
 }
 
@@ -76,5 +68,14 @@ impl<S: Simd, const TURNS: usize> Asked<S, TURNS> {
 pub(super) fn ask_for_brick<V>(values: &[V], brick: usize) {
     if let Some(values) = values.get(brick * BRICK_VOXELS..(brick + 1) * BRICK_VOXELS) {
         prefetch(values);
+    }
+}
+
+/// Asks for the first or the second half of the block of an entry, if it has been made.
+#[inline(always)]
+pub(super) fn ask_for_half(blocks: &Blocks<'_>, entry: usize, is_second: bool) {
+    if let Some(block) = blocks.known(entry) {
+        let (first, second) = block.split_at(block.len() / 2);
+        prefetch(if is_second { second } else { first });
     }
 }

@@ -3,7 +3,7 @@
 use fearless_simd::{Level, Simd, dispatch, f32x16, i32x16, mask32x16, prelude::*};
 use nuage_volume::brick::Bricks;
 
-use super::late::{Asked, Late, ask_for_brick};
+use super::late::{Asked, Late, ask_for_brick, ask_for_half};
 use super::{Lanes, Packet, RAYS, Stretch, each_ray, interpolate, to_int};
 use crate::blocks::Blocks;
 use crate::camera::Ray;
@@ -145,27 +145,82 @@ fn values_at<S: Simd, V: Stored>(lanes: &Lanes<'_, S>, values: &[V], places: i32
     }
 }
 
+/// Goes along all rays from voxel to voxel: calls with each stretch for what its value counts, and, some turns later and in the same
+/// order, with both.
 #[inline(always)]
-fn integrate_voxels<S: Simd, V: Stored>(lanes: &Lanes<'_, S>, values: &[V]) -> [f32; RAYS] {
-    let (simd, none) = (lanes.simd, mask32x16::splat(lanes.simd, false));
-    let (zero, mut depth) = (lanes.splat(0.0), lanes.splat(0.0));
-    let mut asked = Asked::<_, 1>::new(simd);
-    let mut late = Late::<_, VOXEL_TURNS>::new((i32x16::splat(simd, NO_PLACE), zero));
+fn each_voxel<S: Simd, V: Stored>(
+    lanes: &Lanes<'_, S>,
+    values: &[V],
+    mut weigh: impl FnMut(&Stretch<S>) -> f32x16<S>,
+    mut take: impl FnMut(f32x16<S>, f32x16<S>),
+) {
+    let (simd, nobody) = (lanes.simd, mask32x16::splat(lanes.simd, false));
+    let mut asked = Asked::new(simd);
+    let mut late = Late::<_, VOXEL_TURNS>::new((i32x16::splat(simd, NO_PLACE), lanes.splat(0.0)));
     lanes.each_stretch(
         #[inline(always)]
         |stretch| {
-            asked.enter(simd, stretch.cells, |brick, _| ask_for_brick(values, brick));
+            ask_for_brick(values, asked.choose(simd, stretch.cells));
             // Those that have left stand in an empty cell.
             let places = places_of(simd, stretch.cells, to_int(stretch.voxels));
-            if let Some((places, length)) = late.keep((places, stretch.end - stretch.t)) {
-                depth += values_at(lanes, values, places) * length;
+            if let Some((places, weight)) = late.keep((places, weigh(stretch))) {
+                take(values_at(lanes, values, places), weight);
             }
-            none
+            nobody
         },
     );
-    for (places, length) in late.rest() {
-        depth += values_at(lanes, values, places) * length;
+    for (places, weight) in late.rest() {
+        take(values_at(lanes, values, places), weight);
     }
+}
+
+/// Goes along all rays from cell to cell, and calls with each stretch some turns after its block was asked for: two turns after what
+/// says where that is.
+#[inline(always)]
+fn each_cell<'a, S: Simd>(
+    lanes: &Lanes<'_, S>,
+    blocks: &mut Blocks<'a>,
+    mut visit: impl FnMut(&mut Blocks<'a>, &Stretch<S>),
+) {
+    let (simd, nobody) = (lanes.simd, mask32x16::splat(lanes.simd, false));
+    let (zero, nowhere) = (lanes.splat(0.0), i32x16::splat(simd, -1));
+    let filler = Stretch { t: zero, end: zero, voxels: [zero; 3], cells: nowhere, active: nobody };
+    let (mut asked, mut late) = (Asked::new(simd), Late::<_, CELL_TURNS>::new(filler));
+    let (mut next, mut entry, mut is_second) = (0, 0, false);
+    lanes.each_stretch(
+        #[inline(always)]
+        |stretch| {
+            if !is_second {
+                next = asked.choose(simd, stretch.cells);
+                blocks.ask_for_place(next);
+            }
+            ask_for_half(blocks, entry, is_second);
+            if is_second {
+                entry = next;
+            }
+            is_second = !is_second;
+            if let Some(stretch) = late.keep(*stretch) {
+                visit(blocks, &stretch);
+            }
+            nobody
+        },
+    );
+    for stretch in late.rest() {
+        visit(blocks, &stretch);
+    }
+}
+
+#[inline(always)]
+fn integrate_voxels<S: Simd, V: Stored>(lanes: &Lanes<'_, S>, values: &[V]) -> [f32; RAYS] {
+    let mut depth = lanes.splat(0.0);
+    each_voxel(
+        lanes,
+        values,
+        #[inline(always)]
+        |stretch| stretch.end - stretch.t,
+        #[inline(always)]
+        |value, length| depth += value * length,
+    );
     depth.to_array()
 }
 
@@ -176,7 +231,8 @@ fn integrate_cells<'a, S: Simd>(
     blocks: &mut Blocks<'a>,
 ) -> [f32; RAYS] {
     let mut depth = lanes.splat(0.0);
-    lanes.each_stretch_late::<CELL_TURNS>(
+    each_cell(
+        lanes,
         blocks,
         #[inline(always)]
         |blocks, stretch| {
@@ -207,7 +263,8 @@ fn sample_cells<'a, S: Simd>(
     let (zero, one) = (lanes.splat(0.0), lanes.splat(1.0));
     let (per_step, loss) = (one / steps, steps * extinction);
     let (mut number, mut passes) = (zero, one);
-    lanes.each_stretch_late::<CELL_TURNS>(
+    each_cell(
+        lanes,
         blocks,
         #[inline(always)]
         |blocks, stretch| {
@@ -244,29 +301,21 @@ fn sample_voxels<S: Simd, V: Stored>(
     steps: f32x16<S>,
     extinction: f32,
 ) -> [f32; RAYS] {
-    let (simd, none) = (lanes.simd, mask32x16::splat(lanes.simd, false));
-    let (zero, one) = (lanes.splat(0.0), lanes.splat(1.0));
+    let one = lanes.splat(1.0);
     let (per_step, loss) = (one / steps, steps * extinction);
-    let (mut number, mut passes) = (zero, one);
-    let mut asked = Asked::<_, 1>::new(simd);
-    let mut late = Late::<_, VOXEL_TURNS>::new((i32x16::splat(simd, NO_PLACE), zero));
-    lanes.each_stretch(
+    let (mut number, mut passes) = (lanes.splat(0.0), one);
+    each_voxel(
+        lanes,
+        values,
         #[inline(always)]
         |stretch| {
-            asked.enter(simd, stretch.cells, |brick, _| ask_for_brick(values, brick));
-            let places = places_of(simd, stretch.cells, to_int(stretch.voxels));
-            let next = (stretch.end * per_step).ceil().max(number);
-            let samples = next - number;
-            number = next;
-            if let Some((places, samples)) = late.keep((places, samples)) {
-                passes *= power(one - values_at(lanes, values, places) * loss, samples);
-            }
-            none
+            let before = number;
+            number = (stretch.end * per_step).ceil().max(before);
+            number - before
         },
+        #[inline(always)]
+        |value, samples| passes *= power(one - value * loss, samples),
     );
-    for (places, samples) in late.rest() {
-        passes *= power(one - values_at(lanes, values, places) * loss, samples);
-    }
     passes.to_array()
 }
 
@@ -274,17 +323,17 @@ fn sample_voxels<S: Simd, V: Stored>(
 #[inline(always)]
 fn power<S: Simd>(base: f32x16<S>, exponent: f32x16<S>) -> f32x16<S> {
     let simd = base.simd;
-    let (one, even) = (f32x16::splat(simd, 1.0), i32x16::splat(simd, 0));
+    let (one, zero) = (f32x16::splat(simd, 1.0), i32x16::splat(simd, 0));
     let (mut left, mut square) = (exponent.to_int::<i32x16<S>>(), base);
     let mut product = one;
     // Not a loop up to the largest exponent: how often it turns could not be told before.
     for _ in 0..3 {
-        product *= (left & 1).simd_eq(even).select(one, square);
+        product *= (left & 1).simd_eq(zero).select(one, square);
         square *= square;
         left >>= 1;
     }
-    while left.simd_gt(even).any_true() {
-        product *= (left & 1).simd_eq(even).select(one, square);
+    while left.simd_gt(zero).any_true() {
+        product *= (left & 1).simd_eq(zero).select(one, square);
         square *= square;
         left >>= 1;
     }

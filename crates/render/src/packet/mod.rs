@@ -15,7 +15,7 @@ use glam::IVec3;
 use crate::blocks::{self, Blocks};
 use crate::camera::Ray;
 use crate::depth::{NOWHERE, corners_at, corners_from};
-use crate::gather::{gather_f32, gather_i32, prefetch};
+use crate::gather::{gather_f32, gather_i32};
 use crate::simd::each_lane;
 use crate::traverse::Field;
 use crate::walk::{BORDER, BrickMap, SPECIAL};
@@ -30,8 +30,6 @@ pub use lines::{optical_depths, stepped_transmittances};
 pub use surfaces::Surface;
 pub use tracks::first_collisions;
 pub use voxels::first_voxels;
-
-use late::{Asked, Late};
 
 /// Rays of a packet.
 pub const RAYS: usize = 16;
@@ -302,43 +300,6 @@ impl<'m, S: Simd> Lanes<'m, S> {
         }
     }
 
-    /// Goes along all rays and calls with each stretch, but so many turns after its block was asked for: first for what says where
-    /// the block is, two turns later for the block.
-    #[inline(always)]
-    fn each_stretch_late<'a, const TURNS: usize>(
-        &self,
-        blocks: &mut Blocks<'a>,
-        mut visit: impl FnMut(&mut Blocks<'a>, &Stretch<S>),
-    ) {
-        let (zero, nobody) = (self.splat(0.0), mask32x16::splat(self.simd, false));
-        let nowhere = i32x16::splat(self.simd, -1);
-        let filler = Stretch { t: zero, end: zero, voxels: [zero; 3], cells: nowhere, active: nobody };
-        let (mut asked, mut late) = (Asked::<_, 2>::new(self.simd), Late::<_, TURNS>::new(filler));
-        let mut before = 0;
-        self.each_stretch(
-            #[inline(always)]
-            |stretch| {
-                asked.enter(self.simd, stretch.cells, |entry, turn| match turn {
-                    0 => {
-                        blocks.ask_for_place(entry);
-                        ask_for_half(blocks, before, 0);
-                    }
-                    _ => {
-                        ask_for_half(blocks, before, 1);
-                        before = entry;
-                    }
-                });
-                if let Some(stretch) = late.keep(*stretch) {
-                    visit(blocks, &stretch);
-                }
-                nobody
-            },
-        );
-        for stretch in late.rest() {
-            visit(blocks, &stretch);
-        }
-    }
-
     /// How a ray leaves a box that ends at these faces.
     #[inline(always)]
     fn leave(&self, faces: [f32x16<S>; 3], t: f32x16<S>) -> Leaving<S> {
@@ -489,15 +450,6 @@ fn complete<'a>(
             corners[lane] = value;
         }
     });
-}
-
-/// Asks for a half of the block of an entry, if it has been made.
-#[inline(always)]
-fn ask_for_half(blocks: &Blocks<'_>, entry: usize, half: usize) {
-    if let Some(block) = blocks.known(entry) {
-        let (first, second) = block.split_at(block.len() / 2);
-        prefetch(if half == 0 { first } else { second });
-    }
 }
 
 /// Calls with the number of each bit that is set.
