@@ -222,7 +222,7 @@ impl Look {
                 let row = |row: Vec3| row.extend(0.0).to_array();
                 (params.map_x, params.map_y, params.map_z) =
                     (row(rows.x_axis), row(rows.y_axis), row(rows.z_axis));
-                params.map_size = [parts.width, parts.height, TELLING_TURNS, 0];
+                (params.map_size[0], params.map_size[1]) = (parts.width, parts.height);
             }
             even @ Sky::Constant(_) => {
                 let radiance = even.radiance(Vec3::Y).extend(0.0).to_array();

@@ -412,13 +412,13 @@ impl Stages {
         self.timer.as_ref().filter(|_| self.measures.budget_ms.is_some())
     }
 
-    /// Records the way back of times.
     /// Notices whether an encoder that fills the light volume is dropped.
     pub(crate) fn await_fill(&self, encoder: &wgpu::CommandEncoder) {
         let mut awaited = Awaited(Some(self.is_missing.clone()));
         encoder.on_submitted_work_done(move || drop(awaited.0.take()));
     }
 
+    /// Records the way back of times.
     pub(crate) fn send_times_back(&mut self, encoder: &mut wgpu::CommandEncoder) {
         let is_wanted = self.measures.budget_ms.is_some();
         if let Some(timer) = self.timer.as_mut().filter(|_| is_wanted) {

@@ -4,7 +4,9 @@
 
 mod common;
 
-use common::{SIZE, camera_of, channel_of, cloud, gpu, half_cloud, hold, lit, picture, tiles, uploaded};
+use common::{
+    SIZE, camera_of, channel_of, cloud, gpu, half_cloud, hold, is_same_hit, lit, picture, tiles, uploaded,
+};
 use glam::{DVec2, IVec3};
 use nuage_gpu::arrays::{Arrays, Bricks, Meaning, Wanted};
 use nuage_gpu::look::{Look, Pass, channels_of};
@@ -65,15 +67,7 @@ fn hold_views(name: &str, renderer: &mut Renderer, volume: &GpuVolume, channel: 
     for (i, hit) in (0..).zip(&hits) {
         let pixel = DVec2::new(f64::from(i % WIDTH), f64::from(i / WIDTH)) + 0.5;
         let expected = first_voxel(&field, &mut reader, &scene.camera.ray(pixel, WIDTH, HEIGHT), 0.0);
-        let is_same = match expected {
-            None => hit[0] < 0.0,
-            Some(expected) => {
-                let brick = IVec3::new(hit[1] as i32, hit[2] as i32, hit[3] as i32) >> 3;
-                let is_near = (f64::from(hit[0]) / expected.distance - 1.0).abs() < 1e-5;
-                brick == expected.voxel >> 3 && is_near
-            }
-        };
-        same += u32::from(is_same);
+        same += u32::from(is_same_hit(hit, expected.as_ref()));
         met += u32::from(expected.is_some());
     }
     println!(

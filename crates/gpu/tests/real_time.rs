@@ -186,7 +186,7 @@ fn accumulated_pictures_converge() {
             let measures = RealTime { accumulate: true, half_resolution, ..NONE };
             let first = shown(renderer, &volume, &look, COARSE, measures);
             let mut last = Vec::new();
-            for _ in 1..16 {
+            for _ in 1..32 {
                 last = shown(renderer, &volume, &look, COARSE, measures);
             }
             let ([_, before], [mean, after]) = (errors(&first, &reference), errors(&last, &reference));
@@ -194,7 +194,7 @@ fn accumulated_pictures_converge() {
                 "half {half_resolution}: deviation {before:.2e} of the first, {after:.2e} and mean {mean:.2e} of the last"
             );
             // What is finer than the pixels that are marched does not come back as noise goes.
-            let part = if half_resolution { 0.45 } else { 0.35 };
+            let part = if half_resolution { 0.4 } else { 0.3 };
             assert!(after < part * before, "{before} {after}");
         }
     });
@@ -270,14 +270,14 @@ fn moving_cameras_find_the_medium_again() {
     });
 }
 
-/// A quarter of the rays: close to all of them, in well less time, though some of it is the same for both.
+/// A quarter of the rays: close to all of them, in well less time where rays take most of it.
 #[test]
 fn a_quarter_of_the_pixels_is_brought_to_all() {
     with_renderer(|gpu, renderer| {
         let channel = puff();
         let (volume, scene) = (uploaded(gpu, &[&channel]), lit(&channel));
         let look = Look::of_scene(&scene).expect("a look");
-        let quality = Quality { sky_rays: 0, ..FINE };
+        let quality = Quality { step_voxels: 0.25, sun_rays: 32, sky_rays: 0, ..FINE };
         // A budget that is never reached measures.
         let timed = RealTime { budget_ms: Some(f32::MAX), ..NONE };
         let whole = shown(renderer, &volume, &look, quality, timed);
@@ -299,7 +299,7 @@ fn a_quarter_of_the_pixels_is_brought_to_all() {
             "a quarter: mean {mean:.2e}, deviation {deviation:.2e}, {quarter_ms:.1} ms instead of {all_ms:.1}"
         );
         assert!(mean < 0.1 && deviation < 0.2 && deviation > 0.0, "{mean} {deviation}");
-        assert!(all_ms.is_infinite() || quarter_ms < 0.8 * all_ms, "{quarter_ms} of {all_ms}");
+        assert!(all_ms.is_infinite() || quarter_ms < 0.6 * all_ms, "{quarter_ms} of {all_ms}");
     });
 }
 

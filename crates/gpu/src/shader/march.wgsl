@@ -52,18 +52,26 @@ fn with_step(group: SkyGroup, step: vec2<f32>, share: f32) -> SkyGroup {
     return SkyGroup(sum, group.t, (group.random - part) / (1.0 - part));
 }
 
+// Where a walk stands.
+struct Walk { brick: vec3<i32>, t: f32, t_end: f32 }
+
+fn walk_of(runs: Runs) -> Walk {
+    return Walk(runs.brick, runs.t, runs.t_end);
+}
+
+// Goes on with a walk; its leaps are counted from here on.
+fn resumed(field: u32, ray: LocalRay, walk: Walk) -> Runs {
+    return Runs(field, ray, walk.brick, walk.t, walk.t_end, MAX_ROOT_LEAPS, MAX_LEAPS);
+}
+
 // How far a camera ray has got: what is kept while a shadow ray is followed. All else is made anew from the pixel, so that
 // registers are free for the shadow ray.
 struct Progress {
     has_begun: bool,
     // Where the walks through the densities and through what glows stand, and what is left of the runs that they found.
-    brick: vec3<i32>,
-    t: f32,
-    t_end: f32,
+    walk: Walk,
     head: FoundRun,
-    glow_brick: vec3<i32>,
-    glow_t: f32,
-    glow_t_end: f32,
+    glow_walk: Walk,
     glow_head: FoundRun,
     // How many pieces there are still in a stretch of one value.
     pieces_left: f32,
@@ -135,17 +143,11 @@ fn next_shadow_ray(progress: ptr<function, Progress>, ray: Ray, max_distance: f3
         begun.next_sky = sky_shift(random, shift) / max(params.march_rays.y, 1.0);
         begun.sky.random = sky_shift(random, shift);
         let span = density_span - start;
-        let runs = runs_between(density, local, span.x, select(span.x, span.y, has_density));
-        begun.brick = runs.brick;
-        begun.t = runs.t;
-        begun.t_end = runs.t_end;
+        begun.walk = walk_of(runs_between(density, local, span.x, select(span.x, span.y, has_density)));
         begun.head.is_there = true;
         if (HAS_EMISSION) {
             let span = glow_span - start;
-            let runs = runs_between(glow, glow_local, span.x, select(span.x, span.y, has_glow));
-            begun.glow_brick = runs.brick;
-            begun.glow_t = runs.t;
-            begun.glow_t_end = runs.t_end;
+            begun.glow_walk = walk_of(runs_between(glow, glow_local, span.x, select(span.x, span.y, has_glow)));
             begun.glow_head.is_there = true;
         }
         *progress = begun;
@@ -153,8 +155,8 @@ fn next_shadow_ray(progress: ptr<function, Progress>, ray: Ray, max_distance: f3
     var now = *progress;
     var walker = new_accessor();
     var glow_walker = new_accessor();
-    var runs = Runs(density, local, now.brick, now.t, now.t_end, MAX_ROOT_LEAPS, MAX_LEAPS);
-    var glow_runs = Runs(glow, glow_local, now.glow_brick, now.glow_t, now.glow_t_end, MAX_ROOT_LEAPS, MAX_LEAPS);
+    var runs = resumed(density, local, now.walk);
+    var glow_runs = resumed(glow, glow_local, now.glow_walk);
     let full = 1.0 / params.march_rays.x;
     let full_sky = 1.0 / max(params.march_rays.y, 1.0);
     var t = 0.0;
@@ -287,12 +289,8 @@ fn next_shadow_ray(progress: ptr<function, Progress>, ray: Ray, max_distance: f3
             break;
         }
     }
-    now.brick = runs.brick;
-    now.t = runs.t;
-    now.t_end = runs.t_end;
-    now.glow_brick = glow_runs.brick;
-    now.glow_t = glow_runs.t;
-    now.glow_t_end = glow_runs.t_end;
+    now.walk = walk_of(runs);
+    now.glow_walk = walk_of(glow_runs);
     *progress = now;
 
     let voxel = u32(i32(floor((start + t) * voxels_of_density)));

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use glam::{DVec2, DVec3, IVec3};
+use glam::{DVec2, DVec3};
 use nuage_gpu::arrays::{Arrays, Bricks, Meaning, Wanted};
 use nuage_gpu::device::Gpu;
 use nuage_gpu::error::GpuError;
@@ -18,7 +18,7 @@ use nuage_render::framing::{WorldBox, fit_camera, fit_density_scale};
 use nuage_render::light::Sun;
 use nuage_render::march::Quality;
 use nuage_render::scene::{Phase, Scene, Shape, Volume};
-use nuage_render::surface::{SurfaceHit, VoxelHit, first_hit, first_voxel};
+use nuage_render::surface::{SurfaceHit, first_hit, first_voxel};
 use nuage_render::traverse::Field;
 use nuage_render::views::{View, render_view};
 use nuage_vdb::Grid;
@@ -26,7 +26,7 @@ use nuage_volume::channel::Channel;
 use nuage_volume::codec::Codec;
 use nuage_volume::codec::block::{BlockFormat, PackingAxis};
 
-use super::{packed, unpacked_as};
+use super::{differences, is_same_hit, packed, unpacked_as};
 
 /// What is looked at, by name.
 pub struct Subject {
@@ -128,26 +128,28 @@ const PIXELS: usize = (SMALL[0] * SMALL[1]) as usize;
 /// Pictures of the matrix are small.
 pub const SMALL: [u32; 2] = [48, 32];
 
-/// The largest difference of each pixel. Values above 1 count in parts of themselves.
-fn differences(ours: &[[f32; 4]], reference: &[[f32; 4]]) -> Vec<f64> {
-    let error = |(a, b): (&[f32; 4], &[f32; 4])| {
-        a.iter().zip(b).map(|(a, b)| f64::from((a - b).abs() / b.abs().max(1.0))).fold(0.0, f64::max)
-    };
-    ours.iter().zip(reference).map(error).collect()
-}
-
 impl Matrix {
-    /// Notes per-pixel errors, of which `share` may be worse than `tolerance`.
+    fn tally(&mut self, form: &str, pass: &str) -> &mut Tally {
+        self.tallies.entry((form.to_owned(), pass.to_owned())).or_default()
+    }
+
+    /// Counts a picture of so many pixels, those that are good, and those that show something.
+    fn count(&mut self, form: &str, pass: &str, [pixels, good, seen]: [usize; 3]) -> &mut Tally {
+        let tally = self.tally(form, pass);
+        tally.pictures += 1;
+        tally.pixels += pixels as u64;
+        tally.good += good as u64;
+        tally.seen += seen as u64;
+        tally
+    }
+
+    /// Notes per-pixel errors. A few may be worse than `tolerance`.
     fn note(&mut self, form: &str, pass: &str, at: &str, errors: &[f64], seen: usize, tolerance: f64) {
-        let tally = self.tallies.entry((form.to_owned(), pass.to_owned())).or_default();
         let good = errors.iter().filter(|error| **error <= tolerance).count();
         let sum: f64 = errors.iter().map(|error| error.min(1.0)).sum();
         let worst = errors.iter().copied().fold(0.0, f64::max);
-        tally.pictures += 1;
-        tally.pixels += errors.len() as u64;
-        tally.good += good as u64;
+        let tally = self.count(form, pass, [errors.len(), good, seen]);
         tally.sum += sum;
-        tally.seen += seen as u64;
         if worst > tally.worst {
             (tally.worst, tally.worst_at) = (worst, at.to_owned());
         }
@@ -158,7 +160,7 @@ impl Matrix {
         }
     }
 
-    /// Colours may differ by 1/255, and by 10⁻⁴ in the mean.
+    /// Colours may differ by 1/255.
     fn colours(&mut self, form: &str, pass: &str, at: &str, ours: &[[f32; 4]], reference: &[[f32; 4]]) {
         let errors = differences(ours, reference);
         let seen = reference.iter().filter(|pixel| pixel[3] > 0.0).count();
@@ -166,8 +168,7 @@ impl Matrix {
     }
 
     fn left_out(&mut self, form: &str, pass: &str, at: &str, why: &str) {
-        let tally = self.tallies.entry((form.to_owned(), pass.to_owned())).or_default();
-        tally.left_out.push(format!("{at}: {why}"));
+        self.tally(form, pass).left_out.push(format!("{at}: {why}"));
     }
 
     /// Holds all pictures of each form and pass, and of each pass in all forms.
@@ -381,16 +382,11 @@ pub fn hold(matrix: &mut Matrix, renderer: &mut Renderer, pair: &Pair, part: Par
         }
         Pass::Hits { above } => {
             let expected: Vec<_> = rays.map(|ray| first_voxel(&field, &mut reader, &ray, above)).collect();
-            let is_same = |(hit, expected): (&[f32; 4], &Option<VoxelHit>)| match expected {
-                None => hit[0] < 0.0,
-                Some(expected) => {
-                    let brick = IVec3::new(hit[1] as i32, hit[2] as i32, hit[3] as i32) >> 3;
-                    let is_near = (f64::from(hit[0]) / expected.distance - 1.0).abs() < 1e-5;
-                    brick == expected.voxel >> 3 && is_near
-                }
-            };
-            let errors: Vec<f64> =
-                ours.iter().zip(&expected).map(|pair| f64::from(u8::from(!is_same(pair)))).collect();
+            let errors: Vec<f64> = ours
+                .iter()
+                .zip(&expected)
+                .map(|(hit, expected)| f64::from(u8::from(!is_same_hit(hit, expected.as_ref()))))
+                .collect();
             matrix.hits(form, &name, at, &errors, expected.iter().flatten().count());
         }
         Pass::SurfaceHits { level } => {
@@ -433,11 +429,7 @@ fn standard_errors(ours: &[[f32; 4]], theirs: &[[f32; 4]]) -> f64 {
 impl Matrix {
     /// Means may be off by some standard errors: of thousands, one by four and a half.
     fn deviation(&mut self, form: &str, pass: &str, at: &str, errors: f64, seen: usize) {
-        let tally = self.tallies.entry((form.to_owned(), pass.to_owned())).or_default();
-        tally.pictures += 1;
-        tally.pixels += 1;
-        tally.good += u64::from(errors < 4.5);
-        tally.seen += seen as u64;
+        let tally = self.count(form, pass, [1, usize::from(errors < 4.5), seen]);
         if errors > tally.worst {
             (tally.worst, tally.worst_at) = (errors, at.to_owned());
         }
@@ -448,13 +440,9 @@ impl Matrix {
 
     /// Of first hits five pixels in a thousand may differ.
     fn hits(&mut self, form: &str, pass: &str, at: &str, errors: &[f64], seen: usize) {
-        let tally = self.tallies.entry((form.to_owned(), pass.to_owned())).or_default();
         let bad = errors.iter().filter(|error| **error > 1.0 / 255.0).count();
+        let tally = self.count(form, pass, [errors.len(), errors.len() - bad, seen]);
         tally.is_of_hits = true;
-        tally.pictures += 1;
-        tally.pixels += errors.len() as u64;
-        tally.good += (errors.len() - bad) as u64;
-        tally.seen += seen as u64;
         if bad as f64 > 0.005 * errors.len() as f64 {
             tally.failed.push(format!("{at}: {bad} of {} pixels meet something else", errors.len()));
         }

@@ -24,6 +24,7 @@ use nuage_render::camera::Camera;
 use nuage_render::hash::{hash_u32, unit_f32};
 use nuage_render::light::Sun;
 use nuage_render::scene::{Phase, Scene, Shape, Volume};
+use nuage_render::surface::VoxelHit;
 use nuage_vdb::{Grid, Metadata};
 use nuage_volume::brick::{BrickSummary, Bricks};
 use nuage_volume::build::{TileSize, TreeBuilder};
@@ -261,14 +262,27 @@ pub fn uploaded(gpu: &Gpu, channels: &[&Channel]) -> GpuVolume {
     GpuVolume::new(gpu, &Arrays::of_channels(channels).expect("arrays")).expect("a volume")
 }
 
-/// Holds a picture to that of the CPU: within 1/255 per channel on 99.9 % of the pixels, and a mean error of less than
-/// 10⁻⁴. Values above 1 count in parts of themselves.
-pub fn hold(name: &str, ours: &[[f32; 4]], reference: &[[f32; 4]]) {
-    assert_eq!(ours.len(), reference.len(), "{name}");
+/// The largest difference of each pixel. Values above 1 count in parts of themselves.
+pub fn differences(ours: &[[f32; 4]], reference: &[[f32; 4]]) -> Vec<f64> {
+    assert_eq!(ours.len(), reference.len());
     let error = |(a, b): (&[f32; 4], &[f32; 4])| {
         a.iter().zip(b).map(|(a, b)| f64::from((a - b).abs() / b.abs().max(1.0))).fold(0.0, f64::max)
     };
-    let errors: Vec<f64> = ours.iter().zip(reference).map(error).collect();
+    ours.iter().zip(reference).map(error).collect()
+}
+
+/// Whether a pixel of [`nuage_gpu::look::Pass::Hits`] has the voxel that the CPU finds: the same brick, as far away.
+pub fn is_same_hit(hit: &[f32; 4], expected: Option<&VoxelHit>) -> bool {
+    let Some(expected) = expected else { return hit[0] < 0.0 };
+    let brick = IVec3::new(hit[1] as i32, hit[2] as i32, hit[3] as i32) >> 3;
+    let is_near = (f64::from(hit[0]) / expected.distance - 1.0).abs() < 1e-5;
+    brick == expected.voxel >> 3 && is_near
+}
+
+/// Holds a picture to that of the CPU: within 1/255 per channel on 99.9 % of the pixels, and a mean error of less than
+/// 10⁻⁴. Values above 1 count in parts of themselves.
+pub fn hold(name: &str, ours: &[[f32; 4]], reference: &[[f32; 4]]) {
+    let errors = differences(ours, reference);
     let good = errors.iter().filter(|error| **error <= 1.0 / 255.0).count() as f64 / errors.len() as f64;
     let mean = errors.iter().sum::<f64>() / errors.len() as f64;
     let worst = errors.iter().copied().fold(0.0, f64::max);
