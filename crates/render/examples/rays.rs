@@ -13,12 +13,12 @@ use std::time::Instant;
 use glam::{DVec2, DVec3, IVec3, Vec3};
 use nuage_pipeline::import::{import, import_surface};
 use nuage_render::camera::{Camera, Ray};
-use nuage_render::film::Tiling;
 use nuage_render::filter::Filter;
 use nuage_render::hash::{hash_pixel, hash_u32, unit_f32};
 use nuage_render::packet::{
     RAYS, Surface, first_collisions, first_voxels, optical_depths, stepped_transmittances,
 };
+use nuage_render::tiling::Tiling;
 use nuage_render::traverse::{Field, Reader};
 use nuage_testkit::clock::processor_ms;
 use nuage_volume::channel::Channel;

@@ -5,8 +5,8 @@
 
 use glam::Vec3;
 
-use crate::packet::{RAYS, SIDE, square};
 use crate::path::PathSample;
+use crate::tiling::Tiling;
 
 /// The most pixels that one [`Image`] may have: 8192 x 8192, one gibibyte.
 pub const MAX_PIXELS: u64 = 1 << 26;
@@ -297,62 +297,6 @@ impl Film {
     }
 }
 
-/// Pixels per side of a tile, the unit of work of a thread.
-const TILE: u32 = 16;
-
-/// Tiles follow each other down, so many, and then to the right: what rays of one have read is still near when its neighbours
-/// read it.
-const BAND: u32 = 4;
-
-/// How a picture is cut into tiles, and in which order they are made.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Tiling {
-    /// The width of the picture, in pixels.
-    pub width: u32,
-    /// The height of the picture, in pixels.
-    pub height: u32,
-}
-
-impl Tiling {
-    /// How many tiles there are.
-    pub fn count(self) -> u32 {
-        self.width.div_ceil(TILE) * self.height.div_ceil(TILE)
-    }
-
-    /// Column and row of each pixel of a tile, row by row.
-    pub(crate) fn pixels(self, tile: u32) -> impl Iterator<Item = [u32; 2]> {
-        let [columns, rows] = [self.width.div_ceil(TILE), self.height.div_ceil(TILE)];
-        let (band, tile) = (tile / (columns * BAND), tile % (columns * BAND));
-        let down = BAND.min(rows - band * BAND);
-        let [left, top] = [tile / down * TILE, (band * BAND + tile % down) * TILE];
-        let [across, down] = [TILE.min(self.width - left), TILE.min(self.height - top)];
-        (0..across * down).map(move |i| [left + i % across, top + i / across])
-    }
-
-    /// The squares of a tile whose rays make packets. Those at the right and at the bottom may reach beyond the picture.
-    ///
-    /// # Panics
-    /// If there is no such tile.
-    pub fn squares(self, tile: u32) -> impl Iterator<Item = [[u32; 2]; RAYS]> {
-        let corners = self.pixels(tile).filter(|pixel| pixel.iter().all(|at| at % SIDE == 0));
-        corners.map(|[left, top]| square(left, top))
-    }
-
-    /// The pixels of the whole picture, row by row, from those of all tiles.
-    pub(crate) fn rows<P: Copy + Default>(
-        self,
-        tiles: impl IntoIterator<Item = impl IntoIterator<Item = P>>,
-    ) -> Vec<P> {
-        let mut all = vec![P::default(); self.width as usize * self.height as usize];
-        for (tile, pixels) in (0..).zip(tiles) {
-            for ([x, y], pixel) in self.pixels(tile).zip(pixels) {
-                all[y as usize * self.width as usize + x as usize] = pixel;
-            }
-        }
-        all
-    }
-}
-
 /// Pictures side by side on an even, opaque ground of linear `colour`: row by row from the top left, `gap`
 /// pixels between neighbours and none around them. All cells have the size of the largest picture, and a
 /// smaller one lies at the top left of its cell. Fewer pictures than `columns` (at least 1) make a narrower
@@ -564,18 +508,5 @@ mod tests {
         assert!((brighter.noise() - film.noise()).abs() < 1e-12);
         assert_eq!(brighter.image(), film.image().exposed(3.0));
         assert_eq!(film.samples(), [2, 2]);
-    }
-
-    #[test]
-    fn tiles_cover_each_pixel_once() {
-        for (width, height) in [(1, 1), (16, 16), (17, 1), (50, 33)] {
-            let tiling = Tiling { width, height };
-            let tiles: Vec<Vec<[u32; 2]>> =
-                (0..tiling.count()).map(|tile| tiling.pixels(tile).collect()).collect();
-            assert_eq!(tiles.iter().flatten().count(), (width * height) as usize);
-            let rows = tiling.rows(tiles);
-            let expected = (0..width * height).map(|i| [i % width, i / width]);
-            assert!(rows.into_iter().eq(expected));
-        }
     }
 }

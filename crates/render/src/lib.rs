@@ -4,7 +4,7 @@
 //! [`blocks`] keeps
 //! decoded bricks, [`lod`] makes coarser levels; [`packet`] follows sixteen rays at once; [`march`] integrates light along them;
 //! [`path`] follows it through any number of scatterings;
-//! [`picture`] runs both over all pixels, and [`progressive`] paths in passes, until a picture is good enough;
+//! [`picture`] runs both over all pixels in the order of [`tiling`], and [`progressive`] paths in passes, until a picture is good enough;
 //! [`checkpoint`] keeps one that is not; [`framing`] finds views and
 //! densities for volumes that nobody described; [`film`] and [`output`] hold and encode pictures. Physics in
 //! small functions: [`phase`], [`envmap`], [`color`], [`math`]; random numbers: [`hash`], [`sampler`].
@@ -42,6 +42,7 @@ mod shade;
 mod simd;
 mod solid;
 pub mod surface;
+pub mod tiling;
 pub mod track;
 pub mod traverse;
 pub mod views;

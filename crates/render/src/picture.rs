@@ -7,11 +7,12 @@ use std::sync::atomic::{AtomicU32, Ordering};
 
 use glam::DVec2;
 
-use crate::film::{Image, ImageSizeError, Tiling};
+use crate::film::{Image, ImageSizeError};
 use crate::hash::{PLASTIC_STEPS, hash_pixel, unit_f32};
 use crate::march::{Marcher, Quality, Worker};
 use crate::packet::RAYS;
 use crate::scene::Scene;
+use crate::tiling::Tiling;
 
 /// Renders a scene by marching. The picture's alpha is 1 − transmittance; nothing stands behind the medium
 /// yet.
