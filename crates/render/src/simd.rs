@@ -14,6 +14,16 @@ pub(crate) fn level() -> Level {
     *LEVEL
 }
 
+/// All that this crate tells apart and the processor has, the least first.
+#[cfg(test)]
+pub(crate) fn levels() -> Vec<Level> {
+    let mut levels = vec![Level::baseline()];
+    #[cfg(target_arch = "x86_64")]
+    levels.extend(level().as_avx2().map(fearless_simd::Simd::level));
+    levels.push(level());
+    levels
+}
+
 /// An array of what an expression gives for each of eight lanes.
 ///
 /// A macro: functions such as `array::map` are not always inlined where the vector instructions are known, and a call for each

@@ -4,7 +4,7 @@ use fearless_simd::{Level, Simd, dispatch, f32x16, i32x16, mask32x16, prelude::*
 use nuage_volume::brick::Bricks;
 
 use super::late::{Asked, Late, ask_for_brick, ask_for_half};
-use super::{Lanes, Packet, RAYS, Stretch, each_ray, interpolate, to_int};
+use super::{Lanes, Packet, RAYS, Stretch, each_axis, each_ray, interpolate, to_int};
 use crate::blocks::Blocks;
 use crate::camera::Ray;
 use crate::depth::{self, NEAREST_SHIFT, Stored};
@@ -241,8 +241,8 @@ fn integrate_cells<'a, S: Simd>(
                 let length = end - t;
                 let corners = lanes.corners(field, blocks, cells, to_int(voxels));
                 let middle = lanes.at((t + end) * 0.5);
-                let along = |axis: usize| (middle[axis] - voxels[axis], lanes.direction[axis] * length);
-                let ((x, dx), (y, dy), (z, dz)) = (along(0), along(1), along(2));
+                let [x, y, z] = each_axis!(|axis| middle[axis] - voxels[axis]);
+                let [dx, dy, dz] = each_axis!(|axis| lanes.direction[axis] * length);
                 let mean = depth::mean_in_cell!(corners, [x, y, z], [dx, dy, dz]);
                 depth += lanes.with_specials(cells, mean) * length;
             }
@@ -275,8 +275,7 @@ fn sample_cells<'a, S: Simd>(
                 let corners = lanes.corners(field, blocks, cells, to_int(voxels));
                 while inside.any_true() {
                     let position = lanes.at(t_sample);
-                    let along = |axis: usize| position[axis] - voxels[axis];
-                    let value = interpolate(&corners, [along(0), along(1), along(2)]);
+                    let value = interpolate(&corners, each_axis!(|axis| position[axis] - voxels[axis]));
                     let lost = lanes.with_specials(cells, value) * loss;
                     passes *= one - inside.select(lost, zero);
                     number += inside.select(one, zero);

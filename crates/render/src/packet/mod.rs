@@ -56,6 +56,17 @@ macro_rules! each_ray {
 }
 pub(crate) use each_ray;
 
+/// An array of what an expression gives for each axis; see `each_lane`.
+macro_rules! each_axis {
+    (|$axis:ident| $value:expr) => {
+        each_axis!(@ $axis, $value, 0 1 2)
+    };
+    (@ $axis:ident, $value:expr, $($number:literal)*) => {
+        [$({ let $axis: usize = $number; $value }),*]
+    };
+}
+pub(crate) use each_axis;
+
 /// The rays of a packet in the positions of a field, t = 0 being where each enters it. Coordinates come by axis, then by ray.
 struct Packet {
     origin: [[f32; RAYS]; 3],
@@ -211,24 +222,17 @@ impl<'m, S: Simd> Lanes<'m, S> {
     #[inline(always)]
     fn new(simd: S, map: &'m BrickMap, packet: &Packet) -> Self {
         let (zero, one) = (f32x16::splat(simd, 0.0), f32x16::splat(simd, 1.0));
-        let load = |values: &[[f32; RAYS]; 3]| {
-            [
-                f32x16::simd_from(simd, values[0]),
-                f32x16::simd_from(simd, values[1]),
-                f32x16::simd_from(simd, values[2]),
-            ]
-        };
-        let direction = load(&packet.direction);
-        let is_forward = [direction[0].simd_ge(zero), direction[1].simd_ge(zero), direction[2].simd_ge(zero)];
+        let direction = each_axis!(|axis| f32x16::simd_from(simd, packet.direction[axis]));
+        let is_forward = each_axis!(|axis| direction[axis].simd_ge(zero));
         Lanes {
             simd,
             map,
             strides: map.strides().map(|stride| stride as f32),
-            origin: load(&packet.origin),
+            origin: each_axis!(|axis| f32x16::simd_from(simd, packet.origin[axis])),
             direction,
-            inverse: load(&packet.inverse),
-            forward: is_forward.map(|forward| forward.select(one, zero)),
-            sign: is_forward.map(|forward| forward.select(one, -one)),
+            inverse: each_axis!(|axis| f32x16::simd_from(simd, packet.inverse[axis])),
+            forward: each_axis!(|axis| is_forward[axis].select(one, zero)),
+            sign: each_axis!(|axis| is_forward[axis].select(one, -one)),
             ends: f32x16::simd_from(simd, packet.ends),
         }
     }
@@ -241,8 +245,7 @@ impl<'m, S: Simd> Lanes<'m, S> {
     /// Positions along each axis.
     #[inline(always)]
     fn at(&self, t: f32x16<S>) -> [f32x16<S>; 3] {
-        let along = |axis: usize| t * self.direction[axis] + self.origin[axis];
-        [along(0), along(1), along(2)]
+        each_axis!(|axis| t * self.direction[axis] + self.origin[axis])
     }
 
     /// Where bricks stand in the map; an empty one for rays that are not `active`.
@@ -303,8 +306,7 @@ impl<'m, S: Simd> Lanes<'m, S> {
     /// How a ray leaves a box that ends at these faces.
     #[inline(always)]
     fn leave(&self, faces: [f32x16<S>; 3], t: f32x16<S>) -> Leaving<S> {
-        let along = |axis: usize| (faces[axis] - self.origin[axis]) * self.inverse[axis];
-        let t_faces = [along(0), along(1), along(2)];
+        let t_faces = each_axis!(|axis| (faces[axis] - self.origin[axis]) * self.inverse[axis]);
         let t = t_faces[0].min(t_faces[1]).min(t_faces[2]).max(t);
         Leaving { faces, t_faces, t }
     }
@@ -319,8 +321,8 @@ impl<'m, S: Simd> Lanes<'m, S> {
             return Step { t: leaving.t, behind: self.next(&leaving, voxels) };
         }
         let brick_faces = self.faces(bricks_of(voxels), self.beyond(cells));
-        let along = |axis: usize| is_whole.select(brick_faces[axis] * 8.0, faces[axis]);
-        let leaving = self.leave([along(0), along(1), along(2)], t);
+        let faces = each_axis!(|axis| is_whole.select(brick_faces[axis] * 8.0, faces[axis]));
+        let leaving = self.leave(faces, t);
         Step { t: leaving.t, behind: self.behind(&leaving, voxels) }
     }
 
@@ -328,12 +330,12 @@ impl<'m, S: Simd> Lanes<'m, S> {
     #[inline(always)]
     fn step_bricks(&self, bricks: [f32x16<S>; 3], beyond: f32x16<S>, t: f32x16<S>) -> Step<S> {
         let faces = self.faces(bricks, beyond);
-        let along = |axis: usize| faces[axis] * 8.0;
-        let leaving = self.leave([along(0), along(1), along(2)], t);
+        let leaving = self.leave(each_axis!(|axis| faces[axis] * 8.0), t);
         let position = self.at(leaving.t);
-        let along =
-            |axis: usize| self.inside(&leaving, axis, position[axis] * 0.125, bricks[axis], faces[axis]);
-        Step { t: leaving.t, behind: [along(0), along(1), along(2)] }
+        let behind = each_axis!(|axis| {
+            self.inside(&leaving, axis, position[axis] * 0.125, bricks[axis], faces[axis])
+        });
+        Step { t: leaving.t, behind }
     }
 
     /// The places behind the faces by which rays leave boxes, in units of the lattice; along other axes they stay in the box.
@@ -354,26 +356,22 @@ impl<'m, S: Simd> Lanes<'m, S> {
     #[inline(always)]
     fn behind(&self, leaving: &Leaving<S>, voxels: [f32x16<S>; 3]) -> [f32x16<S>; 3] {
         let position = self.at(leaving.t);
-        let along =
-            |axis: usize| self.inside(leaving, axis, position[axis], voxels[axis], leaving.faces[axis]);
-        [along(0), along(1), along(2)]
+        each_axis!(|axis| self.inside(leaving, axis, position[axis], voxels[axis], leaving.faces[axis]))
     }
 
     /// The same where each box is one voxel.
     #[inline(always)]
     fn next(&self, leaving: &Leaving<S>, voxels: [f32x16<S>; 3]) -> [f32x16<S>; 3] {
-        let along = |axis: usize| {
+        each_axis!(|axis| {
             let next = voxels[axis] + self.sign[axis];
             leaving.t_faces[axis].simd_le(leaving.t).select(next, voxels[axis])
-        };
-        [along(0), along(1), along(2)]
+        })
     }
 
     /// The faces towards which rays go, of the boxes of a lattice or of as many more as are `beyond` in all directions.
     #[inline(always)]
     fn faces(&self, places: [f32x16<S>; 3], beyond: f32x16<S>) -> [f32x16<S>; 3] {
-        let along = |axis: usize| places[axis] + self.forward[axis] + self.sign[axis] * beyond;
-        [along(0), along(1), along(2)]
+        each_axis!(|axis| places[axis] + self.forward[axis] + self.sign[axis] * beyond)
     }
 
     /// How many bricks around are empty as well; 0 where a cell holds something.
@@ -393,7 +391,7 @@ impl<'m, S: Simd> Lanes<'m, S> {
         cells: i32x16<S>,
         voxels: [i32x16<S>; 3],
     ) -> [f32x16<S>; 8] {
-        let local = [voxels[0] & 7, voxels[1] & 7, voxels[2] & 7];
+        let local = each_axis!(|axis| voxels[axis] & 7);
         let row = (local[0] << 3) + local[0] + local[1];
         let offsets = ((row << 3) + row + local[2]).to_array();
         let of_map = cells.to_array();
@@ -413,7 +411,7 @@ impl<'m, S: Simd> Lanes<'m, S> {
         match missing {
             0 => found,
             _ => {
-                let voxels = [voxels[0].to_array(), voxels[1].to_array(), voxels[2].to_array()];
+                let voxels = each_axis!(|axis| voxels[axis].to_array());
                 let mut corners = each_lane!(|i| found[i].to_array());
                 complete(field, blocks, missing, &of_map, &voxels, &mut corners);
                 each_lane!(|i| f32x16::simd_from(self.simd, corners[i]))
@@ -464,17 +462,17 @@ fn each_bit(mut bits: u32, mut call: impl FnMut(usize)) {
 /// The bricks of voxels.
 #[inline(always)]
 fn bricks_of<S: Simd>(voxels: [f32x16<S>; 3]) -> [f32x16<S>; 3] {
-    [(voxels[0] * 0.125).trunc(), (voxels[1] * 0.125).trunc(), (voxels[2] * 0.125).trunc()]
+    each_axis!(|axis| (voxels[axis] * 0.125).trunc())
 }
 
 #[inline(always)]
 fn trunc<S: Simd>(positions: [f32x16<S>; 3]) -> [f32x16<S>; 3] {
-    [positions[0].trunc(), positions[1].trunc(), positions[2].trunc()]
+    each_axis!(|axis| positions[axis].trunc())
 }
 
 #[inline(always)]
 fn to_int<S: Simd>(positions: [f32x16<S>; 3]) -> [i32x16<S>; 3] {
-    [positions[0].to_int(), positions[1].to_int(), positions[2].to_int()]
+    each_axis!(|axis| positions[axis].to_int())
 }
 
 /// Between the eight corners of cells, at fractions along each axis.

@@ -3,7 +3,7 @@
 use fearless_simd::{Level, Simd, dispatch, f32x16, mask32x16, prelude::*};
 use glam::Vec3;
 
-use super::{Lanes, Packet, RAYS, Stretch, bricks_of, each_ray, interpolate, to_int, trunc};
+use super::{Lanes, Packet, RAYS, Stretch, bricks_of, each_axis, each_ray, interpolate, to_int, trunc};
 use crate::blocks::Blocks;
 use crate::camera::Ray;
 use crate::simd::level;
@@ -119,8 +119,7 @@ fn meet<'a, S: Simd>(lanes: &Lanes<'_, S>, field: &Field<'a>, blocks: &mut Block
                 let corners = lanes.corners(field, blocks, cells, to_int(voxels));
                 // Where a ray leaves a cell, the value is that of the next one too.
                 let position = lanes.at(end);
-                let along = |axis: usize| position[axis] - voxels[axis];
-                let value = interpolate(&corners, [along(0), along(1), along(2)]);
+                let value = interpolate(&corners, each_axis!(|axis| position[axis] - voxels[axis]));
                 reached &= is_special | value.simd_ge(level);
                 if reached.any_true() {
                     met.rays |= reached.to_bitmask() as u32;
@@ -144,8 +143,7 @@ impl<S: Simd> Met<S> {
     #[inline(always)]
     fn value(&self, lanes: &Lanes<'_, S>, t: f32x16<S>) -> f32x16<S> {
         let position = lanes.at(t);
-        let along = |axis: usize| position[axis] - self.voxels[axis];
-        interpolate(&self.corners, [along(0), along(1), along(2)])
+        interpolate(&self.corners, each_axis!(|axis| position[axis] - self.voxels[axis]))
     }
 
     /// Where the interpolation reaches the level in each cell, which it has done where the ray leaves it.

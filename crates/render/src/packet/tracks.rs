@@ -3,7 +3,7 @@
 use fearless_simd::{Level, Simd, dispatch, f32x16, prelude::*};
 use glam::Vec3;
 
-use super::{Lanes, Packet, RAYS, bricks_of, each_bit, each_ray};
+use super::{Lanes, Packet, RAYS, bricks_of, each_axis, each_bit, each_ray};
 use crate::blocks::Blocks;
 use crate::camera::Ray;
 use crate::depth::{corners_around, interpolate};
@@ -94,8 +94,8 @@ fn collide<'a, S: Simd>(
         let collided = collides.to_bitmask() as u32;
         if collided != 0 {
             let position = lanes.at(t);
-            let place = bricks.map(|along| along.to_array());
-            let position = position.map(|along| along.to_array());
+            let place = each_axis!(|axis| bricks[axis].to_array());
+            let position = each_axis!(|axis| position[axis].to_array());
             let (places, tops) = (places.to_array(), tops.to_array());
             let (mut depths, mut new_ends) = (left.to_array(), ends.to_array());
             let at = t.to_array();
@@ -129,7 +129,6 @@ fn collide<'a, S: Simd>(
             });
             (left, ends) = (f32x16::simd_from(simd, depths), f32x16::simd_from(simd, new_ends));
         }
-        let along = |axis: usize| collides.select(bricks[axis], step.behind[axis]);
-        bricks = [along(0), along(1), along(2)];
+        bricks = each_axis!(|axis| collides.select(bricks[axis], step.behind[axis]));
     }
 }
