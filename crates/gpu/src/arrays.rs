@@ -571,6 +571,30 @@ impl Arrays {
         (self.has_maps, self.maps, self.first_map_words) = (true, words, firsts);
     }
 
+    /// Leaves the maps of all places to others, one behind the other and behind so many words of trees, if they are worth it.
+    /// Gives their words.
+    pub(crate) fn make_maps_elsewhere(&mut self, room: Room) -> usize {
+        let [trees, bricks] = [room.tree_words, room.brick_words].map(|words| 4 * words);
+        let Some(words) = self.map_words().filter(|words| are_maps_worth(4 * words, trees, bricks)) else {
+            return 0;
+        };
+        let mut at = (room.tree_words - self.trees_words()) as u32;
+        self.first_map_words.clear();
+        for place in &self.places {
+            self.first_map_words.push(at);
+            let cells =
+                place.as_ref().map(Place::bricks).and_then(|[first, last]| maps::cell_count(first, last));
+            at += (maps::CELL_WORDS * cells.unwrap_or(0)) as u32;
+        }
+        self.has_maps = true;
+        words
+    }
+
+    /// The words of trees and of what says where they begin.
+    fn trees_words(&self) -> usize {
+        HEADER_WORDS + self.trees.size_bytes() / size_of::<u32>()
+    }
+
     /// Whether all values mean themselves.
     pub(crate) fn are_densities(&self) -> bool {
         self.places.iter().flatten().all(|place| place.meaning == Meaning::Density.line())
@@ -653,7 +677,7 @@ impl Arrays {
         let bricks = |(format, words): (&BlockFormat, &Vec<u32>)| words.len() / blocks::brick_words(*format);
         let mut of_formats = blocks::FORMATS.iter().zip(&self.blocks).map(bricks);
         Room {
-            tree_words: HEADER_WORDS + self.trees.size_bytes() / size_of::<u32>() + self.maps.len(),
+            tree_words: self.trees_words() + self.maps.len(),
             fields: self.places.len().max(1),
             brick_words: self.words.len() + self.shapes.len(),
             blocks: std::array::from_fn(|_| of_formats.next().unwrap_or(0)),
@@ -665,9 +689,8 @@ impl Arrays {
         let field =
             |place: &Option<Place>| place.as_ref().map_or_else(Field::default, |p| p.field(self.origin));
         let mut fields: Vec<Field> = self.places.iter().map(field).collect();
-        let trees_words = HEADER_WORDS + self.trees.size_bytes() / 4;
         for (field, first) in fields.iter_mut().zip(&self.first_map_words) {
-            field.box_last[3] = (trees_words + *first as usize) as i32;
+            field.box_last[3] = (self.trees_words() + *first as usize) as i32;
         }
         if fields.is_empty() {
             fields.push(Field::default());

@@ -18,7 +18,7 @@ pub(crate) const ABSENT_TAG: u32 = 254;
 pub(crate) const TILE_TAGS: [u32; 2] = [252, 253];
 
 /// The furthest that is told.
-const FURTHEST: u32 = 255;
+pub(crate) const FURTHEST: u32 = 255;
 
 /// The most cells in all: what single precision counts, and a binding of the default size holds.
 const MOST_CELLS: i64 = 1 << 24;
@@ -48,11 +48,16 @@ impl Layout {
     }
 }
 
+/// The words of so many cells with nothing anywhere.
+pub(crate) fn empty(cells: usize) -> Vec<u32> {
+    [ABSENT_TAG | FURTHEST << 8, 0].repeat(cells)
+}
+
 /// The words of the map of the bricks from `first` to `last` of the tree of some root cells.
 pub(crate) fn map(trees: &Trees, cells: [u32; 2], first: IVec3, last: IVec3) -> Option<Vec<u32>> {
     let count = cell_count(first, last)?;
     let layout = Layout { first: first - 1, size: last - first + 3 };
-    let mut words = [ABSENT_TAG | FURTHEST << 8, 0].repeat(count);
+    let mut words = empty(count);
     // Puts an entry to all bricks of an aligned cube that lie in the box.
     let mut put = |entry: Entry, corner: IVec3, log2_bricks: u32| {
         let kind = match log2_bricks {

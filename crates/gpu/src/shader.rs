@@ -378,9 +378,9 @@ impl Source {
     }
 }
 
-/// The shader that builds trees, into bricks of so many buffers.
-pub(crate) fn build_text(chunks: u32, log2_chunk_words: u32) -> String {
-    let features = Features { codecs: 0, chunks, log2_chunk_words, ..Features::BARE };
+/// The shader that builds trees, into bricks of so many buffers, and maps of them.
+pub(crate) fn build_text(chunks: u32, log2_chunk_words: u32, has_maps: bool) -> String {
+    let features = Features { codecs: 0, chunks, log2_chunk_words, has_maps, ..Features::BARE };
     let mut text = prelude(&features);
     for chunk in 0..chunks {
         let binding = build::BRICKS_BINDING + chunk;
@@ -396,7 +396,7 @@ pub(crate) fn build_text(chunks: u32, log2_chunk_words: u32) -> String {
         let _ = writeln!(text, "        case {chunk}u: {{ bricks_{chunk}[within] = word; }}");
     }
     text += "        default: { bricks_0[within] = word; }\n    }\n}\n";
-    text + file!("density") + file!("build")
+    text + file!("density") + file!("build") + file!("maps")
 }
 
 /// The shader that puts lists of voxels into dense arrays.
@@ -623,6 +623,7 @@ fn prelude(features: &Features) -> String {
     p.u("NODE4_TILE_TAG", maps::TILE_TAGS[0]);
     p.u("NODE5_TILE_TAG", maps::TILE_TAGS[1]);
     p.u("MAP_CELL_WORDS", maps::CELL_WORDS);
+    p.u("FURTHEST", maps::FURTHEST);
     p.u("VIEW", features.view);
     p.b("HAS_SHORT_STEPS", features.has_short_steps);
     p.b("ARE_DENSITIES", features.are_densities);
@@ -639,6 +640,7 @@ fn prelude(features: &Features) -> String {
     p.u("VOXEL_LAYER", 0u32);
 
     p.u("LANES", build::LANES);
+    p.u("GROUP_BRICKS", build::GROUP_BRICKS);
     p.u("COUNT_WORDS", build::COUNT_WORDS);
     p.u("NODE_INFO_ROWS", build::NODE_INFO_ROWS);
     p.u("NODE_INFO_WORDS", build::NODE_INFO_WORDS);
@@ -796,10 +798,10 @@ mod tests {
                 assert!(text.contains(&format!("fn {}(", source.entry_point())), "{source:?}");
             }
         }
-        for chunks in [1, 4] {
-            let text = build_text(chunks, 25);
+        for (chunks, has_maps) in [(1, false), (4, true)] {
+            let text = build_text(chunks, 25, has_maps);
             validate(&text);
-            for step in build::STEPS {
+            for step in build::STEPS.iter().chain(&build::MAP_STEPS) {
                 assert!(text.contains(&format!("fn {step}(")), "{step}");
             }
         }
