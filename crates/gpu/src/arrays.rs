@@ -27,13 +27,6 @@ use crate::maps;
 use crate::params::{Field, Place};
 use crate::shader::{HEADER_WORDS, codec_bit};
 
-/// Maps of bricks take at most this part of the bytes of trees and bricks: a look-up is then worth its memory, …
-const MAP_SHARE: usize = 8;
-/// … or so many bytes, which no device misses, …
-const SMALL_MAP_BYTES: usize = 4 << 20;
-/// … and with trees no more than any device binds.
-const MAX_TREE_BYTES: usize = 128 << 20;
-
 /// In which form bricks are kept on the device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Bricks {
@@ -116,6 +109,8 @@ pub(crate) struct Room {
     pub(crate) brick_words: usize,
     /// Bricks in textures, by [`blocks::FORMATS`].
     pub(crate) blocks: [usize; 3],
+    /// The most bytes that maps may bring all this to: [`maps::most_bytes`].
+    pub(crate) most_bytes: usize,
 }
 
 impl Room {
@@ -126,7 +121,17 @@ impl Room {
             fields: self.fields.max(other.fields),
             brick_words: self.brick_words.max(other.brick_words),
             blocks: std::array::from_fn(|i| self.blocks[i].max(other.blocks[i])),
+            most_bytes: self.most_bytes.max(other.most_bytes),
         }
+    }
+
+    /// Whether maps of so many words are worth it beside what there is room for.
+    pub(crate) fn are_maps_worth(&self, words: usize) -> bool {
+        let of_blocks = blocks::FORMATS.iter().zip(self.blocks);
+        let of_blocks: usize = of_blocks.map(|(format, bricks)| bricks * blocks::brick_words(*format)).sum();
+        let [maps, trees, bricks] =
+            [words, self.tree_words, self.brick_words + of_blocks].map(|words| 4 * words);
+        maps::are_worth(maps, trees, bricks, self.most_bytes)
     }
 }
 
@@ -530,8 +535,8 @@ impl Arrays {
 
     /// Makes maps of all places, unless they are large beside what stands there already.
     fn make_maps_where_worth(&mut self) {
-        let [trees, bricks] = self.size_bytes();
-        if self.map_words().is_some_and(|words| are_maps_worth(4 * words, trees, bricks)) {
+        let room = self.room();
+        if self.map_words().is_some_and(|words| room.are_maps_worth(words)) {
             self.make_maps();
         }
     }
@@ -574,8 +579,7 @@ impl Arrays {
     /// Leaves the maps of all places to others, one behind the other and behind so many words of trees, if they are worth it.
     /// Gives their words.
     pub(crate) fn make_maps_elsewhere(&mut self, room: Room) -> usize {
-        let [trees, bricks] = [room.tree_words, room.brick_words].map(|words| 4 * words);
-        let Some(words) = self.map_words().filter(|words| are_maps_worth(4 * words, trees, bricks)) else {
+        let Some(words) = self.map_words().filter(|words| room.are_maps_worth(*words)) else {
             return 0;
         };
         let mut at = (room.tree_words - self.trees_words()) as u32;
@@ -681,7 +685,17 @@ impl Arrays {
             fields: self.places.len().max(1),
             brick_words: self.words.len() + self.shapes.len(),
             blocks: std::array::from_fn(|_| of_formats.next().unwrap_or(0)),
+            most_bytes: self.most_bytes(),
         }
+    }
+
+    /// The most bytes that maps may bring all this to.
+    fn most_bytes(&self) -> usize {
+        let floats = codec_bit(Codec::F32) | codec_bit(Codec::F16);
+        let is_brick = |entry: &&Entry| matches!(entry.content(), Some(Content::Brick { .. }));
+        let bricks = self.trees.entries.iter().filter(is_brick).count();
+        let counts = [self.trees.node5s.len(), self.trees.node4s.len(), bricks];
+        maps::most_bytes(counts, self.codecs & !floats != 0)
     }
 
     /// All fields, frame by frame. One at least, since no buffer is empty.
@@ -726,11 +740,6 @@ impl Arrays {
     pub(crate) fn brick_words(&self) -> [&[u32]; 2] {
         [&self.words, &self.shapes]
     }
-}
-
-/// Whether maps are worth their bytes beside trees and bricks.
-pub(crate) fn are_maps_worth(maps: usize, trees: usize, bricks: usize) -> bool {
-    maps <= SMALL_MAP_BYTES.max((trees + bricks) / MAP_SHARE) && trees + maps <= MAX_TREE_BYTES
 }
 
 fn place_of(

@@ -360,7 +360,9 @@ impl Room {
     fn of_arrays(&self, channels: usize) -> arrays::Room {
         let [tree_words, brick_words] =
             [self.tree_words(), self.bricks * BRICK_VOXELS as u64].map(|words| words as usize);
-        arrays::Room { tree_words, fields: channels.max(1), brick_words, blocks: [0; 3] }
+        let counts = [self.channels, self.node4s, self.bricks].map(|count| count as usize);
+        let most_bytes = maps::most_bytes(counts, false);
+        arrays::Room { tree_words, fields: channels.max(1), brick_words, blocks: [0; 3], most_bytes }
     }
 
     /// As `Arrays::tree_words` has it. There are no shapes.
