@@ -338,6 +338,12 @@ impl Arrays {
         }
     }
 
+    /// The same, to be looked up by the tree.
+    #[cfg(test)]
+    pub(crate) fn without_maps(self) -> Arrays {
+        Arrays { has_maps: false, maps: Vec::new(), first_map_words: Vec::new(), ..self }
+    }
+
     /// Moves bricks and shapes at these offsets to textures, for tests of their decoders.
     #[cfg(test)]
     pub(crate) fn move_to_textures(&mut self, bricks: &[(Codec, u32)], shapes: &[(Codec, u32)]) {
