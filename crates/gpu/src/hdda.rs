@@ -118,7 +118,7 @@ pub(crate) const PASS_SAMPLES: Body = Body {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
-    use glam::{BVec3, DVec3, IVec3};
+    use glam::{DVec3, IVec3};
     use nuage_render::camera::Camera;
     use nuage_render::hash::hash_pixel;
     use nuage_render::light::Sky;
@@ -242,7 +242,7 @@ pub(crate) mod tests {
             let ahead = IVec3::select(forward, IVec3::ONE, IVec3::NEG_ONE);
             let crossed = leaves.cmple(DVec3::splat(leaves.min_element()));
             assert!(t1 == end || crossed.bitmask().count_ones() == 1, "a ray through an edge");
-            voxel += IVec3::select(BVec3::from(crossed), ahead, IVec3::ZERO);
+            voxel += IVec3::select(crossed, ahead, IVec3::ZERO);
             t = t1;
         }
         [steps as f32, empty as f32, (trail >> 8) as f32, length as f32]
@@ -273,7 +273,7 @@ pub(crate) mod tests {
             let far = DVec3::select(direction.cmpgt(DVec3::ZERO), size + 8.0, DVec3::splat(8.0));
             let leaves =
                 ((far - whole - parts) / direction).map(|t| if t.is_finite() { t } else { f64::MAX });
-            let end = if i % 4 == 0 { 37.0 + 3.0 / 512.0 } else { f64::MAX };
+            let end = if i.is_multiple_of(4) { 37.0 + 3.0 / 512.0 } else { f64::MAX };
             ([whole + parts, direction], leaves.min_element().min(end))
         };
         (0..RAYS).map(ray).collect()
