@@ -27,13 +27,6 @@ use crate::maps;
 use crate::params::{Field, Place};
 use crate::shader::{HEADER_WORDS, codec_bit};
 
-/// Maps of bricks take at most this part of the bytes of trees and bricks: a look-up is then worth its memory, …
-const MAP_SHARE: usize = 8;
-/// … or so many bytes, which no device misses, …
-const SMALL_MAP_BYTES: usize = 4 << 20;
-/// … and with trees no more than any device binds.
-const MAX_TREE_BYTES: usize = 128 << 20;
-
 /// In which form bricks are kept on the device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Bricks {
@@ -116,6 +109,8 @@ pub(crate) struct Room {
     pub(crate) brick_words: usize,
     /// Bricks in textures, by [`blocks::FORMATS`].
     pub(crate) blocks: [usize; 3],
+    /// The most bytes that maps may bring all this to: [`maps::most_bytes`].
+    pub(crate) most_bytes: usize,
 }
 
 impl Room {
@@ -126,7 +121,17 @@ impl Room {
             fields: self.fields.max(other.fields),
             brick_words: self.brick_words.max(other.brick_words),
             blocks: std::array::from_fn(|i| self.blocks[i].max(other.blocks[i])),
+            most_bytes: self.most_bytes.max(other.most_bytes),
         }
+    }
+
+    /// Whether maps of so many words are worth it beside what there is room for.
+    pub(crate) fn are_maps_worth(&self, words: usize) -> bool {
+        let of_blocks = blocks::FORMATS.iter().zip(self.blocks);
+        let of_blocks: usize = of_blocks.map(|(format, bricks)| bricks * blocks::brick_words(*format)).sum();
+        let [maps, trees, bricks] =
+            [words, self.tree_words, self.brick_words + of_blocks].map(|words| 4 * words);
+        maps::are_worth(maps, trees, bricks, self.most_bytes)
     }
 }
 
@@ -333,6 +338,12 @@ impl Arrays {
         }
     }
 
+    /// The same, to be looked up by the tree.
+    #[cfg(test)]
+    pub(crate) fn without_maps(self) -> Arrays {
+        Arrays { has_maps: false, maps: Vec::new(), first_map_words: Vec::new(), ..self }
+    }
+
     /// Moves bricks and shapes at these offsets to textures, for tests of their decoders.
     #[cfg(test)]
     pub(crate) fn move_to_textures(&mut self, bricks: &[(Codec, u32)], shapes: &[(Codec, u32)]) {
@@ -530,8 +541,8 @@ impl Arrays {
 
     /// Makes maps of all places, unless they are large beside what stands there already.
     fn make_maps_where_worth(&mut self) {
-        let [trees, bricks] = self.size_bytes();
-        if self.map_words().is_some_and(|words| are_maps_worth(4 * words, trees, bricks)) {
+        let room = self.room();
+        if self.map_words().is_some_and(|words| room.are_maps_worth(words)) {
             self.make_maps();
         }
     }
@@ -569,6 +580,29 @@ impl Arrays {
             firsts.push(first);
         }
         (self.has_maps, self.maps, self.first_map_words) = (true, words, firsts);
+    }
+
+    /// Leaves the maps of all places to others, one behind the other and behind so many words of trees, if they are worth it.
+    /// Gives their words.
+    pub(crate) fn make_maps_elsewhere(&mut self, room: Room) -> usize {
+        let Some(words) = self.map_words().filter(|words| room.are_maps_worth(*words)) else {
+            return 0;
+        };
+        let mut at = (room.tree_words - self.trees_words()) as u32;
+        self.first_map_words.clear();
+        for place in &self.places {
+            self.first_map_words.push(at);
+            let cells =
+                place.as_ref().map(Place::bricks).and_then(|[first, last]| maps::cell_count(first, last));
+            at += (maps::CELL_WORDS * cells.unwrap_or(0)) as u32;
+        }
+        self.has_maps = true;
+        words
+    }
+
+    /// The words of trees and of what says where they begin.
+    fn trees_words(&self) -> usize {
+        HEADER_WORDS + self.trees.size_bytes() / size_of::<u32>()
     }
 
     /// Whether all values mean themselves.
@@ -653,11 +687,21 @@ impl Arrays {
         let bricks = |(format, words): (&BlockFormat, &Vec<u32>)| words.len() / blocks::brick_words(*format);
         let mut of_formats = blocks::FORMATS.iter().zip(&self.blocks).map(bricks);
         Room {
-            tree_words: HEADER_WORDS + self.trees.size_bytes() / size_of::<u32>() + self.maps.len(),
+            tree_words: self.trees_words() + self.maps.len(),
             fields: self.places.len().max(1),
             brick_words: self.words.len() + self.shapes.len(),
             blocks: std::array::from_fn(|_| of_formats.next().unwrap_or(0)),
+            most_bytes: self.most_bytes(),
         }
+    }
+
+    /// The most bytes that maps may bring all this to.
+    fn most_bytes(&self) -> usize {
+        let floats = codec_bit(Codec::F32) | codec_bit(Codec::F16);
+        let is_brick = |entry: &&Entry| matches!(entry.content(), Some(Content::Brick { .. }));
+        let bricks = self.trees.entries.iter().filter(is_brick).count();
+        let counts = [self.trees.node5s.len(), self.trees.node4s.len(), bricks];
+        maps::most_bytes(counts, self.codecs & !floats != 0)
     }
 
     /// All fields, frame by frame. One at least, since no buffer is empty.
@@ -665,9 +709,8 @@ impl Arrays {
         let field =
             |place: &Option<Place>| place.as_ref().map_or_else(Field::default, |p| p.field(self.origin));
         let mut fields: Vec<Field> = self.places.iter().map(field).collect();
-        let trees_words = HEADER_WORDS + self.trees.size_bytes() / 4;
         for (field, first) in fields.iter_mut().zip(&self.first_map_words) {
-            field.box_last[3] = (trees_words + *first as usize) as i32;
+            field.box_last[3] = (self.trees_words() + *first as usize) as i32;
         }
         if fields.is_empty() {
             fields.push(Field::default());
@@ -703,11 +746,6 @@ impl Arrays {
     pub(crate) fn brick_words(&self) -> [&[u32]; 2] {
         [&self.words, &self.shapes]
     }
-}
-
-/// Whether maps are worth their bytes beside trees and bricks.
-pub(crate) fn are_maps_worth(maps: usize, trees: usize, bricks: usize) -> bool {
-    maps <= SMALL_MAP_BYTES.max((trees + bricks) / MAP_SHARE) && trees + maps <= MAX_TREE_BYTES
 }
 
 fn place_of(

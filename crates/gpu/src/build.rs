@@ -3,8 +3,8 @@
 //!
 //! The words are those of `nuage_volume`'s builder and packer over `nuage_pipeline::import`, entry for entry, but that equal
 //! masks and nodes are not shared: bricks of one value become tiles, those of zeros vanish, what touches a value has an entry,
-//! and bounds are those of trilinear footprints. Room for the largest tree of an array's size is taken once; building again
-//! allocates nothing, and is the same work each time.
+//! and bounds are those of trilinear footprints. Maps of bricks, where they are worth it, are those of [`crate::maps`]. Room for
+//! the largest tree of an array's size is taken once; building again allocates nothing, and is the same work each time.
 //!
 //! What does not live here: how a volume is drawn ([`crate::renderer`]), and trees from files ([`crate::arrays`]).
 
@@ -19,14 +19,19 @@ use nuage_volume::space::{
 use crate::arrays::{self, Arrays, Meaning};
 use crate::device::Gpu;
 use crate::error::GpuError;
+use crate::maps;
 use crate::params::Place;
 use crate::shader::{HEADER_WORDS, build_text, scatter_text};
 use crate::upload::{Volume, bind, buffer_entry, most_bytes, storage_entry};
 
 /// Lanes of a workgroup: one for each row of slots of a `Node4`.
 pub(crate) const LANES: u32 = 1 << (2 * LOG2_NODE4_BRICKS);
-/// The steps of a build, by their entry points.
+/// The steps of a build, by their entry points; …
 pub(crate) const STEPS: [&str; 5] = ["summarise", "nodes", "root", "entries", "bricks"];
+/// … and those that come behind where there is a map.
+pub(crate) const MAP_STEPS: [&str; 3] = ["map_z", "map_y", "map_x"];
+/// The bricks along z of a workgroup that takes several: rows of values side by side.
+pub(crate) const GROUP_BRICKS: u32 = 8;
 /// The words of the scratch buffer that count: bricks, and the bits of the largest value.
 pub(crate) const COUNT_WORDS: u64 = 4;
 /// Where, in what is known of a node, the rows of its slots begin.
@@ -35,6 +40,8 @@ pub(crate) const NODE_INFO_ROWS: u32 = 8;
 pub(crate) const NODE_INFO_WORDS: u32 = NODE_INFO_ROWS + LANES;
 /// The words of what is known of a brick: its number and eight bounds.
 const BRICK_INFO_WORDS: u64 = 17;
+/// The words of what is known of a cell of a map: how far along z, and along z and y, the nearest entry is.
+const CELL_INFO_WORDS: u64 = 2;
 /// The binding of the first buffer of bricks.
 pub(crate) const BRICKS_BINDING: u32 = 5;
 /// What values mean; other than these, a density.
@@ -95,6 +102,7 @@ struct Params {
     bricks: [u32; 4],
     nodes: [u32; 4],
     first: [u32; 4],
+    map: [u32; 4],
 }
 
 /// As `Scatter` in `shader/scatter.wgsl`.
@@ -147,7 +155,7 @@ impl Builder {
             places.push(place(grid, room.channels));
             params.push(room.take(grid)?);
         }
-        let arrays = Arrays::of_places(places);
+        let mut arrays = Arrays::of_places(places);
         let most = most_bytes(gpu);
         let within = |what, words: u64, limit_bytes: u64| match 4 * words {
             size_bytes if size_bytes > limit_bytes => Err(GpuError::Limit { what, size_bytes, limit_bytes }),
@@ -155,16 +163,33 @@ impl Builder {
         };
         // Offsets have 32 bits.
         within("the bricks of a volume", room.bricks * BRICK_VOXELS as u64, 1 << 34)?;
-        let mut volume = Volume::with_room(gpu, room.of_arrays(grids.len()))?;
+        let mut room_of_arrays = room.of_arrays(grids.len());
+        let map_words = arrays.make_maps_elsewhere(room_of_arrays);
+        room_of_arrays.tree_words += map_words;
+        let mut volume = Volume::with_room(gpu, room_of_arrays)?;
         volume.fill(gpu, &arrays)?;
         let (tree, fields, bricks) = volume.parts();
         gpu.guarded(|| gpu.queue().write_buffer(tree, 0, bytemuck::cast_slice(&room.header())))?;
+        if arrays.has_maps() {
+            // What no node reaches stays as it is.
+            let empty = maps::empty(map_words / maps::CELL_WORDS);
+            let at = 4 * room.tree_words();
+            gpu.guarded(|| gpu.queue().write_buffer(tree, at, bytemuck::cast_slice(&empty)))?;
+            for (params, (place, field)) in
+                params.iter_mut().zip(arrays.places().iter().flatten().zip(arrays.fields()))
+            {
+                let [first, last] = place.bricks();
+                params.map = (last - first + 3).extend(field.box_last[3]).as_uvec4().to_array();
+            }
+        }
 
         let (layout, scatter_layout) =
             (layout(gpu, BRICKS_BINDING as usize + bricks.len())?, layout(gpu, 3)?);
         let (chunks, log2_chunk_words) = volume.chunks();
-        let text = build_text(chunks, log2_chunk_words);
-        let steps = STEPS.iter().map(|step| pipeline(gpu, &layout, &text, step)).collect::<Result<_, _>>()?;
+        let text = build_text(chunks, log2_chunk_words, arrays.has_maps());
+        let of_maps = MAP_STEPS.iter().filter(|_| arrays.has_maps());
+        let steps = STEPS.iter().chain(of_maps).map(|step| pipeline(gpu, &layout, &text, step));
+        let steps = steps.collect::<Result<_, _>>()?;
         let scatter = pipeline(gpu, &scatter_layout, &scatter_text(), "scatter")?;
         let mut channels = Vec::with_capacity(grids.len());
         for (grid, params) in grids.iter().zip(params) {
@@ -215,8 +240,11 @@ impl Builder {
                 pass.dispatch_workgroups(x, y, 1);
             }
             pass.set_bind_group(0, &channel.group, &[]);
-            let Params { bricks, nodes, .. } = channel.params;
-            for (step, [x, y, z, _]) in self.steps.iter().zip([bricks, nodes, [1; 4], nodes, bricks]) {
+            let Params { bricks, nodes, map, .. } = channel.params;
+            let rows = [bricks[0], bricks[1], bricks[2].div_ceil(GROUP_BRICKS), 0];
+            let cells = [(map[1] * map[2]).div_ceil(LANES), map[0], 1, 0];
+            let groups = [rows, nodes, [1; 4], nodes, rows, cells, cells, cells];
+            for (step, [x, y, z, _]) in self.steps.iter().zip(groups) {
                 pass.set_pipeline(step);
                 pass.dispatch_workgroups(x, y, z);
             }
@@ -300,6 +328,7 @@ impl Room {
             bricks: with(bricks, index(self.bricks)?),
             nodes: with(nodes, index(self.channels)?),
             first: [index(self.node4s)?, index(self.entries)?, index(self.mask_words)?, band.to_bits()],
+            map: [0; 4],
         };
         let words = |slots: usize| mask::most_words(slots) as u64;
         self.channels += 1;
@@ -331,7 +360,9 @@ impl Room {
     fn of_arrays(&self, channels: usize) -> arrays::Room {
         let [tree_words, brick_words] =
             [self.tree_words(), self.bricks * BRICK_VOXELS as u64].map(|words| words as usize);
-        arrays::Room { tree_words, fields: channels.max(1), brick_words, blocks: [0; 3] }
+        let counts = [self.channels, self.node4s, self.bricks].map(|count| count as usize);
+        let most_bytes = maps::most_bytes(counts, false);
+        arrays::Room { tree_words, fields: channels.max(1), brick_words, blocks: [0; 3], most_bytes }
     }
 
     /// As `Arrays::tree_words` has it. There are no shapes.
@@ -350,7 +381,10 @@ impl Room {
 
 fn scratch_words(params: &Params) -> u64 {
     let count = |sides: [u32; 4]| sides[..3].iter().map(|side| u64::from(*side)).product::<u64>();
-    COUNT_WORDS + u64::from(NODE_INFO_WORDS) * count(params.nodes) + BRICK_INFO_WORDS * count(params.bricks)
+    COUNT_WORDS
+        + u64::from(NODE_INFO_WORDS) * count(params.nodes)
+        + BRICK_INFO_WORDS * count(params.bricks)
+        + CELL_INFO_WORDS * count(params.map)
 }
 
 /// Whether a grid is as it should be.

@@ -18,6 +18,7 @@ mod budget;
 pub mod build;
 pub mod device;
 pub mod error;
+mod hdda;
 mod light_volume;
 pub mod look;
 mod maps;

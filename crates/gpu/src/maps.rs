@@ -2,7 +2,8 @@
 //! words where the tree takes some twenty, and rays leap over what is empty (Cohen & Sheffer, "Proximity Clouds – an Acceleration
 //! Technique for 3D Grid Traversal", 1994).
 //!
-//! Maps stand behind the trees in the same buffer; volumes so sparse that maps would be large beside the rest do without.
+//! Maps stand behind the trees in the same buffer; volumes so sparse that maps would be large beside the rest do without
+//! ([`are_worth`]).
 //! What does not live here: the maps of the CPU (`nuage_render::walk`), and the walk (`shader/walk.wgsl`).
 
 use glam::IVec3;
@@ -18,7 +19,31 @@ pub(crate) const ABSENT_TAG: u32 = 254;
 pub(crate) const TILE_TAGS: [u32; 2] = [252, 253];
 
 /// The furthest that is told.
-const FURTHEST: u32 = 255;
+pub(crate) const FURTHEST: u32 = 255;
+
+/// Maps take at most this part of the bytes of trees and bricks: a look-up is then worth its memory, …
+const SHARE: usize = 8;
+/// … or so many bytes, which no device misses, …
+const SMALL_BYTES: usize = 4 << 20;
+/// … and with trees no more than any device binds.
+const MOST_TREE_BYTES: usize = 128 << 20;
+
+/// The bytes of a `Node5`, a `Node4` and a brick of floats where nodes have a slot for each child: those of NanoVDB
+/// (`PNanoVDB.h`, version 32).
+const FLAT_BYTES: [usize; 3] = [270_400, 33_856, 2_144];
+
+/// The most that maps may bring a volume to: a twentieth more than flat nodes and floats take, and half of that where bricks are
+/// packed. Few voxels far apart would have maps many times as large as themselves.
+pub(crate) fn most_bytes(nodes_and_bricks: [usize; 3], are_packed: bool) -> usize {
+    let flat: usize = nodes_and_bricks.iter().zip(FLAT_BYTES).map(|(count, bytes)| count * bytes).sum();
+    if are_packed { flat / 2 } else { flat / 20 * 21 }
+}
+
+/// Whether maps of so many bytes are worth it beside trees and bricks.
+pub(crate) fn are_worth(maps: usize, trees: usize, bricks: usize, most: usize) -> bool {
+    let is_little = maps <= SMALL_BYTES.max((trees + bricks) / SHARE);
+    is_little && trees + maps <= MOST_TREE_BYTES && trees + bricks + maps <= most
+}
 
 /// The most cells in all: what single precision counts, and a binding of the default size holds.
 const MOST_CELLS: i64 = 1 << 24;
@@ -48,11 +73,16 @@ impl Layout {
     }
 }
 
+/// The words of so many cells with nothing anywhere.
+pub(crate) fn empty(cells: usize) -> Vec<u32> {
+    [ABSENT_TAG | FURTHEST << 8, 0].repeat(cells)
+}
+
 /// The words of the map of the bricks from `first` to `last` of the tree of some root cells.
 pub(crate) fn map(trees: &Trees, cells: [u32; 2], first: IVec3, last: IVec3) -> Option<Vec<u32>> {
     let count = cell_count(first, last)?;
     let layout = Layout { first: first - 1, size: last - first + 3 };
-    let mut words = [ABSENT_TAG | FURTHEST << 8, 0].repeat(count);
+    let mut words = empty(count);
     // Puts an entry to all bricks of an aligned cube that lie in the box.
     let mut put = |entry: Entry, corner: IVec3, log2_bricks: u32| {
         let kind = match log2_bricks {
@@ -135,6 +165,36 @@ fn tell_distances(words: &mut [u32], size: IVec3) {
     for x in inner(0).rev() {
         for y in inner(1).rev() {
             inner(2).rev().for_each(|z| pass(x, y, z, -1));
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The bytes of the map of a box of bricks.
+    fn map_bytes(side: i32) -> usize {
+        4 * CELL_WORDS * cell_count(IVec3::ZERO, IVec3::splat(side - 1)).expect("few cells")
+    }
+
+    #[test]
+    fn maps_make_no_volume_larger_than_flat_nodes() {
+        // A brick in each of so many places of a box, in bricks of floats and of four bits.
+        for (side, bricks) in [(1, 1), (8, 100), (16, 4096), (40, 30_000), (62, 2), (62, 60_000), (100, 20)] {
+            let node4s = (side as usize).div_ceil(16).pow(3).min(bricks);
+            let counts = [1, node4s, bricks];
+            let trees = 8 * bricks + 700 * node4s + 4600;
+            let flat = most_bytes(counts, false) * 20 / 21;
+            for (brick_bytes, are_packed) in [(2048, false), (260, true)] {
+                let (maps, bricks) = (map_bytes(side), brick_bytes * bricks);
+                let is_worth = are_worth(maps, trees, bricks, most_bytes(counts, are_packed));
+                let total = trees + bricks + maps;
+                let is_within = if are_packed { 2 * total <= flat } else { 20 * total <= 21 * flat + 20 };
+                assert!(is_within || !is_worth, "{side}: {total} bytes beside {flat}");
+                let is_sparse = side > 16 && bricks < 100 * brick_bytes;
+                assert_eq!(is_worth, !is_sparse, "{side}: {maps} bytes for {bricks}");
+            }
         }
     }
 }

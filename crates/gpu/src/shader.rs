@@ -19,6 +19,7 @@ use nuage_volume::space::{
 
 use crate::blocks::FORMATS;
 use crate::build;
+use crate::hdda::{ADD_VOXELS, Layer, MEET_VOXEL, PASS_SAMPLES, PASS_VOXELS};
 use crate::maps::{self, ABSENT_TAG};
 use crate::params::{self, Field, MAX_LIGHTS, MAX_MEDIA};
 use crate::upload::FIRST_TEXTURE;
@@ -216,6 +217,9 @@ pub(crate) enum Source {
     /// Small functions over many inputs, for tests.
     #[cfg(test)]
     Twins,
+    /// Walks that tell what they visit, for tests.
+    #[cfg(test)]
+    Visits,
 }
 
 macro_rules! file {
@@ -254,6 +258,8 @@ impl Source {
             Source::Tone => "tone",
             #[cfg(test)]
             Source::Twins => "twins",
+            #[cfg(test)]
+            Source::Visits => "visits",
         }
     }
 
@@ -275,60 +281,8 @@ impl Source {
         COMMON.iter().for_each(|part| text += part);
         let end = if features.has_depth { file!("depth_end") } else { file!("open_end") };
         let kind = if features.is_real_time { file!("real_time") } else { file!("still") };
-        let first_voxel = hdda(
-            features,
-            &Body {
-                name: "meet_voxel",
-                state: "VoxelHit",
-                layer: Layer::Voxel,
-                enter: "",
-                // By rounding a ray may begin beside the active voxels, where anything is stored.
-                step: "if (value > (*state).above && t0 < t1
-                    && is_active(field, (brick << vec3<u32>(LOG2_BRICK)) + local_of(cell))) {
-                *state = VoxelHit(true, (*state).above, t0, brick, cell, value);
-                return;
-            }",
-                empty: "",
-            },
-        );
-        let nearest_steps = hdda(
-            features,
-            &Body {
-                name: "pass_voxels",
-                state: "Passing",
-                layer: Layer::Brick,
-                enter: "",
-                step: "pass_brick(field, values, words, ray, corner, t1, state);",
-                empty: "(*state).number = max((*state).number, ceil(t1));",
-            },
-        );
-        let samples = hdda(
-            features,
-            &Body {
-                name: "pass_samples",
-                state: "Passing",
-                layer: Layer::Brick,
-                enter: "",
-                step: "var samples = (*state).accessor;
-                let end = ceil(t1);
-                for (var number = ceil(t0); number < end; number += 1.0) {
-                    (*state).share *= 1.0 - (*state).loss * trilinear(field, &samples, ray_at(ray, number));
-                }
-                (*state).accessor = samples;",
-                empty: "",
-            },
-        );
-        let voxel_depth = hdda(
-            features,
-            &Body {
-                name: "add_voxels",
-                state: "f32",
-                layer: Layer::Voxel,
-                enter: "",
-                step: "*state += value * max(t1 - t0, 0.0);",
-                empty: "",
-            },
-        );
+        let [first_voxel, nearest_steps, samples, voxel_depth] =
+            [MEET_VOXEL, PASS_VOXELS, PASS_SAMPLES, ADD_VOXELS].map(|body| body.text(features.has_maps));
         let sky_map = if features.sky_map[0] { file!("envmap") } else { file!("even_sky") };
         let media = if features.is_one_grid() { file!("one_grid") } else { file!("media") };
         let marching = [
@@ -372,15 +326,19 @@ impl Source {
             Source::Tone => &[],
             #[cfg(test)]
             Source::Twins => &[file!("twins")],
+            #[cfg(test)]
+            Source::Visits => {
+                &[file!("cells"), file!("visits"), &crate::hdda::tests::bodies(features.has_maps)]
+            }
         };
         own.iter().for_each(|part| text += part);
         text
     }
 }
 
-/// The shader that builds trees, into bricks of so many buffers.
-pub(crate) fn build_text(chunks: u32, log2_chunk_words: u32) -> String {
-    let features = Features { codecs: 0, chunks, log2_chunk_words, ..Features::BARE };
+/// The shader that builds trees, into bricks of so many buffers, and maps of them.
+pub(crate) fn build_text(chunks: u32, log2_chunk_words: u32, has_maps: bool) -> String {
+    let features = Features { codecs: 0, chunks, log2_chunk_words, has_maps, ..Features::BARE };
     let mut text = prelude(&features);
     for chunk in 0..chunks {
         let binding = build::BRICKS_BINDING + chunk;
@@ -396,51 +354,12 @@ pub(crate) fn build_text(chunks: u32, log2_chunk_words: u32) -> String {
         let _ = writeln!(text, "        case {chunk}u: {{ bricks_{chunk}[within] = word; }}");
     }
     text += "        default: { bricks_0[within] = word; }\n    }\n}\n";
-    text + file!("density") + file!("build")
+    text + file!("density") + file!("build") + file!("maps")
 }
 
 /// The shader that puts lists of voxels into dense arrays.
 pub(crate) fn scatter_text() -> String {
     prelude(&Features::BARE) + file!("density") + file!("scatter")
-}
-
-/// Down to which layer a walk goes by itself.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Layer {
-    /// A step for each brick.
-    Brick,
-    /// A step for each voxel of a brick.
-    Voxel,
-}
-
-/// What a walk does: WGSL that sees `field`, `ray`, `brick`, `region`, `cell`, `value`,
-/// `t0`, `t1` and `state`.
-struct Body<'a> {
-    name: &'a str,
-    /// The type that `state` points to.
-    state: &'a str,
-    layer: Layer,
-    /// Where a brick begins, before its steps; it does not see `cell` and `value`.
-    enter: &'a str,
-    /// At each step; `return;` ends the walk.
-    step: &'a str,
-    /// In each empty region.
-    empty: &'a str,
-}
-
-/// A walk with its body put in, so that nothing is called.
-fn hdda(features: &Features, body: &Body<'_>) -> String {
-    let layer = match body.layer {
-        Layer::Brick => "BRICK_LAYER",
-        Layer::Voxel => "VOXEL_LAYER",
-    };
-    let walk = if features.has_maps { file!("hdda_map") } else { file!("hdda") };
-    walk.replace("$NAME", body.name)
-        .replace("$STATE", body.state)
-        .replace("$LAYER", layer)
-        .replace("$ENTER", body.enter)
-        .replace("$STEP", body.step)
-        .replace("$EMPTY", body.empty)
 }
 
 /// Reads a word of the bricks, from whichever buffer holds it.
@@ -623,6 +542,7 @@ fn prelude(features: &Features) -> String {
     p.u("NODE4_TILE_TAG", maps::TILE_TAGS[0]);
     p.u("NODE5_TILE_TAG", maps::TILE_TAGS[1]);
     p.u("MAP_CELL_WORDS", maps::CELL_WORDS);
+    p.u("FURTHEST", maps::FURTHEST);
     p.u("VIEW", features.view);
     p.b("HAS_SHORT_STEPS", features.has_short_steps);
     p.b("ARE_DENSITIES", features.are_densities);
@@ -635,10 +555,11 @@ fn prelude(features: &Features) -> String {
     // What a sample leaves of the light at least, and how far rounding moves faces, as a part of a ray's length.
     p.f("LEAST_SHARE", 0.5 * f32::EPSILON);
     p.f("FACE_BLUR", 4.0 * f32::EPSILON);
-    p.u("BRICK_LAYER", 1u32);
-    p.u("VOXEL_LAYER", 0u32);
+    p.u("BRICK_LAYER", Layer::Brick as u32);
+    p.u("VOXEL_LAYER", Layer::Voxel as u32);
 
     p.u("LANES", build::LANES);
+    p.u("GROUP_BRICKS", build::GROUP_BRICKS);
     p.u("COUNT_WORDS", build::COUNT_WORDS);
     p.u("NODE_INFO_ROWS", build::NODE_INFO_ROWS);
     p.u("NODE_INFO_WORDS", build::NODE_INFO_WORDS);
@@ -782,6 +703,7 @@ mod tests {
             Source::Shadow,
             Source::Tone,
             Source::Twins,
+            Source::Visits,
         ];
         let tricubic = Features { lookup: Lookup::Tricubic, glow_channel: Some(0), ..Features::BARE };
         validate(&probe());
@@ -796,28 +718,14 @@ mod tests {
                 assert!(text.contains(&format!("fn {}(", source.entry_point())), "{source:?}");
             }
         }
-        for chunks in [1, 4] {
-            let text = build_text(chunks, 25);
+        for (chunks, has_maps) in [(1, false), (4, true)] {
+            let text = build_text(chunks, 25, has_maps);
             validate(&text);
-            for step in build::STEPS {
+            for step in build::STEPS.iter().chain(&build::MAP_STEPS) {
                 assert!(text.contains(&format!("fn {step}(")), "{step}");
             }
         }
         validate(&scatter_text());
-    }
-
-    #[test]
-    fn walks_take_any_body() {
-        let body = Body {
-            name: "count",
-            state: "vec2<u32>",
-            layer: Layer::Brick,
-            enter: "",
-            step: "(*state).x += 1u;",
-            empty: "(*state).y += 1u;",
-        };
-        let all = Features::ALL;
-        validate(&(Source::Views.text(&all) + &hdda(&all, &body)));
     }
 
     #[test]

@@ -9,7 +9,7 @@
 
 use nuage_volume::format::Asset;
 
-use crate::arrays::{Arrays, Bricks, Room, Wanted, are_maps_worth};
+use crate::arrays::{Arrays, Bricks, Room, Wanted};
 use crate::device::Gpu;
 use crate::error::GpuError;
 use crate::upload::Volume;
@@ -62,8 +62,7 @@ impl Stream {
             common.append_places(&arrays);
         }
         // What is the same for all: maps, or none.
-        let [trees, bricks] = [room.tree_words, room.brick_words].map(|words| 4 * words);
-        if let Some(words) = map_words.filter(|words| are_maps_worth(4 * words, trees, bricks)) {
+        if let Some(words) = map_words.filter(|words| room.are_maps_worth(*words)) {
             room.tree_words += words;
             common.set_maps();
         }

@@ -110,7 +110,8 @@ fn ball(at: IVec3) -> f32 {
     at.as_vec3().distance(Vec3::new(24.3, 20.1, 27.7)) - 17.5
 }
 
-/// A cloud of a file, level sets as fog and as surfaces, dots across the borders of nodes, and values of all kinds.
+/// A cloud of a file, level sets as fog and as surfaces, dots across the borders of nodes, a wall at one, and values of all
+/// kinds.
 fn arrays() -> Vec<Array> {
     let path = nuage_testkit::committed("oracle/oracle_64.vdb");
     let file = nuage_vdb::File::open(std::fs::read(path).expect("readable")).expect("a VDB file");
@@ -125,6 +126,15 @@ fn arrays() -> Vec<Array> {
             let is_dot = random(3, at) < 3e-4 || at == IVec3::new(119, 7, 119) || at.x == 120;
             if is_dot { 1e-3 + random(4, at) } else { 0.0 }
         }),
+        // The nodes before it hold nothing, but touch it: tiles of zeros.
+        Array::new(
+            "wall",
+            [150, 40, 20],
+            Meaning::Density,
+            |at| {
+                if at.x >= 120 { random(7, at) } else { 0.0 }
+            },
+        ),
         Array::new("strange", [40, 33, 17], Meaning::Density, |at| match (at.x / 8, at.z) {
             (0, _) => 2.0,
             (1, z) if z < 8 => f32::INFINITY,
@@ -204,7 +214,7 @@ fn hold_entry(name: &str, ours: &Side, theirs: &Side, [a, b]: [Entry; 2], level:
     }
 }
 
-/// Ten builds of each of five grids, with other values in the same memory between them.
+/// Ten builds of each of six grids, with other values in the same memory between them.
 #[test]
 fn trees_are_those_of_the_processor() {
     let Some(gpu) = gpu() else { return };
@@ -236,10 +246,22 @@ fn trees_are_those_of_the_processor() {
         let entries = hold_entry(name, &ours, &theirs, [a.entry, b.entry], 2);
         assert!(entries > 50, "{name}: {entries} entries");
         let mut fields: Vec<Field> = bytemuck::pod_collect_to_vec(&fields);
-        fields.iter_mut().for_each(|field| field.index_offset = [0; 4]);
         let mut of_reference = reference.fields();
-        // What is built has no map of bricks.
-        of_reference.iter_mut().for_each(|field| field.box_last[3] = 0);
+        // The map of the processor for the tree of the device, and beside that of its own.
+        let at = |field: &Field| field.box_last[3] as usize;
+        let map = &tree[at(&fields[0])..];
+        let [first, last] = builder.volume.place(0, 0).expect("a place").bricks();
+        let of_processor = maps::map(&ours.trees, [0, 1], first, last).expect("a map");
+        let kinds = |map: &[u32]| map.iter().step_by(maps::CELL_WORDS).copied().collect::<Vec<_>>();
+        assert!(builder.volume.has_maps() && map == of_processor, "{name}: the map");
+        assert_eq!(name == "wall", kinds(map).iter().any(|kind| kind & 0xff == maps::TILE_TAGS[0]), "{name}");
+        assert!(
+            kinds(map) == kinds(&reference.tree_words()[at(&of_reference[0])..]),
+            "{name}: kinds in the map"
+        );
+        for field in fields.iter_mut().chain(&mut of_reference) {
+            (field.index_offset, field.box_last[3]) = ([0; 4], 0);
+        }
         assert_eq!(fields, of_reference, "{name}");
         assert_eq!(built.largest, reference.largest(0), "{name}");
         assert_eq!(built.bricks as usize * BRICK_VOXELS, reference.brick_words()[0].len(), "{name}");
@@ -268,7 +290,7 @@ fn lists_and_channels_stand_beside_each_other() {
         let turned = Grid { values: Values::Dense { values, strides: [1, x, x * y] }, ..array.grid(&gpu) };
         let mut builder = Builder::new(&gpu, &[of_list, turned]).expect("a builder");
         let built = builder.run().expect("a build");
-        let [tree, _, bricks] = words(&builder);
+        let [tree, fields, bricks] = words(&builder);
         let ours = Side { trees: trees(&tree), bricks };
         let reference = array.arrays();
         let theirs =
@@ -276,6 +298,12 @@ fn lists_and_channels_stand_beside_each_other() {
         assert_eq!((built.len(), ours.trees.cells.len()), (2, 2));
         for cell in &ours.trees.cells {
             hold_entry(array.name, &ours, &theirs, [cell.entry, theirs.trees.cells[0].entry], 2);
+        }
+        let fields: Vec<Field> = bytemuck::pod_collect_to_vec(&fields);
+        for (field, channel) in fields.iter().zip(0..) {
+            let [first, last] = builder.volume.place(0, channel as usize).expect("a place").bricks();
+            let map = maps::map(&ours.trees, [channel, 1], first, last).expect("a map");
+            assert!(tree[field.box_last[3] as usize..][..map.len()] == map, "{}: map {channel}", array.name);
         }
     }
 }
@@ -295,6 +323,13 @@ fn what_does_not_fit_is_said() {
         panic!("24 bricks in 5")
     };
     assert_eq!((size_bytes, limit_bytes, cell_count(&builder)), (24 * 2048, 5 * 2048, 0));
+    let [tree, fields, _] = words(&builder);
+    let map = &tree[fields[FIELD_CELL_COUNT + 4] as usize..];
+    assert_eq!(
+        map,
+        maps::empty(map.len() / maps::CELL_WORDS),
+        "nothing is met by whoever looks nevertheless"
+    );
     gpu.queue().write_buffer(values, 0, &vec![0; array.values.len() * 4]);
     assert_eq!(builder.run(), Ok(vec![Built { bricks: 0, largest: 0.0 }]));
     assert_eq!(cell_count(&builder), 0);

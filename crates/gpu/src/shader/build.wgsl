@@ -16,6 +16,8 @@ struct Build {
     nodes: vec4<u32>,
     // The first node, the first entry and the first word of masks of this channel, and a level set's band.
     first: vec4<u32>,
+    // Cells of the map along each axis, and its first word.
+    map: vec4<u32>,
 }
 
 @group(0) @binding(0) var<uniform> build: Build;
@@ -24,7 +26,7 @@ struct Build {
 @group(0) @binding(3) var<storage, read_write> tree: array<u32>;
 @group(0) @binding(4) var<storage, read_write> fields: array<u32>;
 
-// What stands in `scratch`: counts, then what is known of nodes, the brick numbers, and the bounds of bricks.
+// What stands in `scratch`: counts, then what is known of nodes, the brick numbers, the bounds of bricks, and distances in the map.
 
 // Entries, bricks, footprint, largest value, whether there is a value above 0; then the first entry and the first brick; then
 // a word for each row of slots, which of them have an entry below and which of these are bricks above.
@@ -57,38 +59,53 @@ fn value_at(voxel: vec3<u32>) -> u32 {
     return density(values[at.x + at.y + at.z], build.size.w, build.first.w);
 }
 
-var<workgroup> least: array<atomic<u32>, 8>;
-var<workgroup> most: array<atomic<u32>, 8>;
+fn hull(a: vec2<u32>, b: vec2<u32>) -> vec2<u32> {
+    return vec2<u32>(min(a.x, b.x), max(a.y, b.y));
+}
 
-// The bounds of each brick, and of its voxels at the low end of some axes: a workgroup a brick.
-@compute @workgroup_size(8, 8)
-fn summarise(
-    @builtin(workgroup_id) brick: vec3<u32>, @builtin(local_invocation_id) row: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    if (lane < 8u) {
-        atomicStore(&least[lane], NONE);
-        atomicStore(&most[lane], 0u);
-    }
-    workgroupBarrier();
-    let first = value_at(brick * 8u + vec3<u32>(row.xy, 0u));
-    var all = vec2<u32>(first);
-    for (var z = 1u; z < 8u; z++) {
-        let value = value_at(brick * 8u + vec3<u32>(row.xy, z));
-        all = vec2<u32>(min(all.x, value), max(all.y, value));
-    }
-    for (var axes = 0u; axes < 8u; axes++) {
-        if (((axes & 4u) == 0u || row.x == 0u) && ((axes & 2u) == 0u || row.y == 0u)) {
-            let found = select(all, vec2<u32>(first), (axes & 1u) != 0u);
-            atomicMin(&least[axes], found.x);
-            atomicMax(&most[axes], found.y);
+// Of each lane of `summarise`, the bounds of its voxels: all, those at the low end of z, of x, and of both.
+var<workgroup> layers: array<array<vec2<u32>, 4>, 8u * GROUP_BRICKS>;
+
+// The brick of a lane of a workgroup that takes some along z: eight lanes a brick, each the layer of a y.
+fn brick_of_lane(group: vec3<u32>, lane: vec3<u32>) -> vec3<u32> {
+    return vec3<u32>(group.xy, GROUP_BRICKS * group.z + lane.y);
+}
+
+// The bounds of each brick, and of its voxels at the low end of some axes.
+@compute @workgroup_size(8, GROUP_BRICKS)
+fn summarise(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_id) lane: vec3<u32>) {
+    let brick = brick_of_lane(group, lane);
+    let corner = 8u * brick + vec3<u32>(0u, lane.x, 0u);
+    var all = vec2<u32>(NONE, 0u);
+    var low_z = all;
+    for (var x = 0u; x < 8u; x++) {
+        let first = value_at(corner + vec3<u32>(x, 0u, 0u));
+        var row = vec2<u32>(first);
+        for (var z = 1u; z < 8u; z++) {
+            row = hull(row, vec2<u32>(value_at(corner + vec3<u32>(x, 0u, z))));
+        }
+        all = hull(all, row);
+        low_z = hull(low_z, vec2<u32>(first));
+        if (x == 0u) {
+            layers[8u * lane.y + lane.x][2] = row;
+            layers[8u * lane.y + lane.x][3] = vec2<u32>(first);
         }
     }
+    layers[8u * lane.y + lane.x][0] = all;
+    layers[8u * lane.y + lane.x][1] = low_z;
     workgroupBarrier();
-    if (lane < 8u) {
-        let at = summary_of(brick) + 2u * lane;
-        scratch[at] = atomicLoad(&least[lane]);
-        scratch[at + 1u] = atomicLoad(&most[lane]);
+    // Now a lane for each set of axes.
+    let axes = lane.x;
+    let which = ((axes >> 1u) & 2u) | (axes & 1u);
+    let end = select(8u, 1u, (axes & 2u) != 0u);
+    var found = vec2<u32>(NONE, 0u);
+    for (var y = 0u; y < end; y++) {
+        found = hull(found, layers[8u * lane.y + y][which]);
+    }
+    if (brick.z < build.bricks.z) {
+        let at = summary_of(brick) + 2u * axes;
+        scratch[at] = found.x;
+        scratch[at + 1u] = found.y;
     }
 }
 
@@ -196,7 +213,9 @@ fn row_brick(node: vec3<u32>, lane: u32) -> vec3<u32> {
     return (node << vec3<u32>(LOG2_NODE4_BRICKS)) + vec3<u32>(lane >> 4u, lane & 15u, 0u);
 }
 
-var<workgroup> node_sums: array<atomic<u32>, 3>;
+var<workgroup> least: atomic<u32>;
+var<workgroup> most: array<atomic<u32>, 2>;
+var<workgroup> node_sums: array<atomic<u32>, 2>;
 
 // What stands in each `Node4`: a workgroup a node, a lane for sixteen slots.
 @compute @workgroup_size(LANES)
@@ -204,7 +223,7 @@ fn nodes(@builtin(workgroup_id) node: vec3<u32>, @builtin(local_invocation_index
     let index = (node.x * build.nodes.y + node.y) * build.nodes.z + node.z;
     let info = node_info(index);
     if (lane == 0u) {
-        atomicStore(&least[0], NONE);
+        atomicStore(&least, NONE);
         atomicStore(&most[0], 0u);
         atomicStore(&most[1], 0u);
         atomicStore(&node_sums[0], 0u);
@@ -219,7 +238,7 @@ fn nodes(@builtin(workgroup_id) node: vec3<u32>, @builtin(local_invocation_index
         // Also what is zero itself but touches something else has an entry.
         present |= u32(leaf.footprint.y != 0u) << z;
         is_brick |= u32(leaf.own.x != leaf.own.y) << z;
-        atomicMin(&least[0], leaf.footprint.x);
+        atomicMin(&least, leaf.footprint.x);
         atomicMax(&most[0], leaf.footprint.y);
         atomicMax(&most[1], leaf.own.y);
     }
@@ -232,7 +251,7 @@ fn nodes(@builtin(workgroup_id) node: vec3<u32>, @builtin(local_invocation_index
     if (lane == 0u) {
         scratch[info] = atomicLoad(&node_sums[0]);
         scratch[info + 1u] = atomicLoad(&node_sums[1]);
-        scratch[info + 2u] = atomicLoad(&least[0]);
+        scratch[info + 2u] = atomicLoad(&least);
         scratch[info + 3u] = atomicLoad(&most[0]);
         scratch[info + 4u] = atomicLoad(&most[1]);
     }
@@ -264,10 +283,15 @@ fn power_of_two_above(bits: u32) -> u32 {
     return min((bits >> 23u) + u32(!is_exact), 254u) << 23u;
 }
 
-fn write_entry(index: u32, payload: u32, tag: u32, footprint: vec2<u32>, unit: u32) {
+// The tag and the bounds of an entry.
+fn kind_of(tag: u32, footprint: vec2<u32>, unit: u32) -> u32 {
+    return tag | (pack(footprint, unit) << 8u);
+}
+
+fn write_entry(index: u32, payload: u32, kind: u32) {
     let at = tree[ENTRIES] + 2u * index;
     tree[at] = payload;
-    tree[at + 1u] = tag | (pack(footprint, unit) << 8u);
+    tree[at + 1u] = kind;
 }
 
 // The `Node5` with its entries, and where what is below each `Node4` begins: one workgroup, whose lanes each take as many
@@ -306,9 +330,8 @@ fn root(@builtin(local_invocation_index) lane: u32) {
         let is_there = scratch[info + 4u] != 0u;
         let index = build.first.x + before.z;
         // A place without a value that touches some is a tile of zeros.
-        write_entry(
-            first_entry + before.w, select(0u, index, is_there), select(CONSTANT_TAG, NODE_TAG, is_there), footprint, unit,
-        );
+        let tag = select(CONSTANT_TAG, NODE_TAG, is_there);
+        write_entry(first_entry + before.w, select(0u, index, is_there), kind_of(tag, footprint, unit));
         let place = vec3<u32>(
             node / (build.nodes.y * build.nodes.z), node / build.nodes.z % build.nodes.y, node % build.nodes.z,
         );
@@ -340,7 +363,7 @@ fn root(@builtin(local_invocation_index) lane: u32) {
     tree[cell + 1u] = 0u;
     tree[cell + 2u] = 0u;
     tree[cell + 3u] = channel;
-    tree[cell + 4u] = NODE_TAG | (pack(vec2<u32>(0u, atomicLoad(&most[0])), unit) << 8u);
+    tree[cell + 4u] = kind_of(NODE_TAG, vec2<u32>(0u, atomicLoad(&most[0])), unit);
     // What does not fit is not there at all.
     let is_shown = total.z != 0u && total.y <= build.strides.w;
     fields[channel * FIELD_WORDS + FIELD_BOUNDS_UNIT] = unit;
@@ -349,45 +372,63 @@ fn root(@builtin(local_invocation_index) lane: u32) {
     scratch[1] = atomicLoad(&most[1]);
 }
 
-// The entries of each `Node4`: a workgroup a node, a lane for sixteen slots.
+// The entries of each `Node4`, and the cells of the map that they stand in: a workgroup a node, a lane for sixteen slots.
 @compute @workgroup_size(LANES)
 fn entries(@builtin(workgroup_id) node: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
     let info = node_info((node.x * build.nodes.y + node.y) * build.nodes.z + node.z);
-    let is_there = scratch[info + 4u] != 0u;
+    let own_field = build.nodes.w * FIELD_WORDS;
+    let is_shown = fields[own_field + FIELD_CELL_COUNT] != 0u;
+    let unit = fields[own_field + FIELD_BOUNDS_UNIT];
+    let is_there = is_shown && scratch[info + 4u] != 0u;
     let row = select(0u, scratch[info + NODE_INFO_ROWS + lane], is_there);
     let present = row & 0xffffu;
     let is_brick = row >> 16u;
     let before = sums_before(lane, vec4<u32>(countOneBits(present), countOneBits(is_brick), 0u, 0u));
-    let unit = fields[build.nodes.w * FIELD_WORDS + FIELD_BOUNDS_UNIT];
     var entry = scratch[info + 5u] + before.x;
     var number = scratch[info + 6u] + before.y;
+    // What is in the map where a slot has no entry: nothing, or the tile around it.
+    var around = ABSENT_TAG | (FURTHEST << 8u);
+    if (is_shown && !is_there && scratch[info + 3u] != 0u) {
+        around = kind_of(NODE4_TILE_TAG, vec2<u32>(scratch[info + 2u], scratch[info + 3u]), unit);
+    }
     for (var z = 0u; z < 16u; z++) {
+        let brick = row_brick(node, lane) + vec3<u32>(0u, 0u, z);
         if (((present >> z) & 1u) == 0u) {
+            write_cell(brick, 0u, around);
             continue;
         }
-        let brick = row_brick(node, lane) + vec3<u32>(0u, 0u, z);
         let leaf = leaf_at(brick);
+        var payload = leaf.own.x;
+        var tag = CONSTANT_TAG;
         if (((is_brick >> z) & 1u) != 0u) {
-            write_entry(entry, number * BRICK_VOXELS, F32_TAG, leaf.footprint, unit);
+            payload = number * BRICK_VOXELS;
+            tag = F32_TAG;
             scratch[number_of(brick - 1u)] = number;
             number++;
-        } else {
-            write_entry(entry, leaf.own.x, CONSTANT_TAG, leaf.footprint, unit);
         }
+        let kind = kind_of(tag, leaf.footprint, unit);
+        write_entry(entry, payload, kind);
+        write_cell(brick, payload, kind);
         entry++;
     }
 }
 
-// The values of each brick: a workgroup a brick.
-@compute @workgroup_size(8, 8)
-fn bricks(@builtin(workgroup_id) brick: vec3<u32>, @builtin(local_invocation_id) row: vec3<u32>) {
+// The values of each brick.
+@compute @workgroup_size(8, GROUP_BRICKS)
+fn bricks(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_id) lane: vec3<u32>) {
+    let brick = brick_of_lane(group, lane);
     let own = low_bounds(brick + 1u, 0u);
-    let number = scratch[number_of(brick)];
-    if (own.x == own.y || number - build.bricks.w >= build.strides.w) {
+    if (brick.z >= build.bricks.z || own.x == own.y) {
         return;
     }
-    let at = number * BRICK_VOXELS + (row.x << 6u) + (row.y << 3u);
-    for (var z = 0u; z < 8u; z++) {
-        set_brick_word(at + z, value_at(brick * 8u + vec3<u32>(row.xy, z)));
+    let number = scratch[number_of(brick)];
+    if (number - build.bricks.w >= build.strides.w) {
+        return;
+    }
+    let at = number * BRICK_VOXELS + (lane.x << 3u);
+    for (var x = 0u; x < 8u; x++) {
+        for (var z = 0u; z < 8u; z++) {
+            set_brick_word(at + (x << 6u) + z, value_at(8u * brick + vec3<u32>(x, lane.x, z)));
+        }
     }
 }

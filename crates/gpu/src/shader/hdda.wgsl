@@ -1,5 +1,5 @@
-// The walk with a body given when the shader is made: what to do when bricks begin, at each step, and in empty space, and the
-// layer at which to stop. Capitals behind a dollar sign are put in from Rust; a body sees all names below, and ends the walk by `return`.
+// The walk with a body given when the shader is made: what to do at each step and in empty space, and the layer at which to
+// stop. Capitals behind a dollar sign are put in from Rust: nuage_gpu::hdda, which says what a body sees.
 
 fn $NAME(field: u32, ray: LocalRay, begin: f32, end: f32, state: ptr<function, $STATE>) {
     var accessor = new_accessor();
@@ -24,9 +24,9 @@ fn $NAME(field: u32, ray: LocalRay, begin: f32, end: f32, state: ptr<function, $
         }
         let corner = corner_of(field, brick);
         let words = brick_of(values, region.entry);
-        $ENTER
         if ($LAYER == BRICK_LAYER || tag == CONSTANT_TAG) {
             let cell = cells_between(ray, t0, t1, corner).packed;
+            // Bricks have no value of their own.
             let value = select(0.0, meant(field, bitcast<f32>(region.entry.payload)), tag == CONSTANT_TAG);
             $STEP
             continue;

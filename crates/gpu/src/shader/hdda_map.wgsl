@@ -46,7 +46,6 @@ fn $NAME(field: u32, ray: LocalRay, begin: f32, end: f32, state: ptr<function, $
             let brick = vec3<i32>(local) + base;
             let words = brick_of(values, Entry(tree[at + 1u], kind));
             var cells = cells_between(ray, t0, t1, corner);
-            $ENTER
             if ($LAYER == BRICK_LAYER) {
                 let cell = cells.packed;
                 let value = 0.0;
