@@ -2,6 +2,7 @@
 //!
 //! What does not live here: buffers of volumes ([`crate::upload`]) and pipelines ([`crate::renderer`]).
 
+use std::ops::Range;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
@@ -233,11 +234,17 @@ impl Gpu {
     /// # Errors
     /// If the device is lost or has no memory left.
     pub fn read(&self, buffer: &wgpu::Buffer) -> Result<Vec<u8>, GpuError> {
+        self.read_range(buffer, 0..buffer.size())
+    }
+
+    /// As [`Gpu::read`], of some of the bytes, from one multiple of four to another.
+    pub(crate) fn read_range(&self, buffer: &wgpu::Buffer, range: Range<u64>) -> Result<Vec<u8>, GpuError> {
         let usage = wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::MAP_READ;
-        let staging = self.empty_buffer("nuage read-back", buffer.size(), usage)?;
+        let size = range.end - range.start;
+        let staging = self.empty_buffer("nuage read-back", size, usage)?;
         self.guarded(|| {
             let mut encoder = self.device.create_command_encoder(&Default::default());
-            encoder.copy_buffer_to_buffer(buffer, 0, &staging, 0, buffer.size());
+            encoder.copy_buffer_to_buffer(buffer, range.start, &staging, 0, size);
             self.queue.submit([encoder.finish()]);
         })?;
         let mapped: Arc<Mutex<Option<Result<(), wgpu::BufferAsyncError>>>> = Arc::default();

@@ -27,6 +27,7 @@ mod params;
 pub mod picture;
 pub mod real_time;
 pub mod renderer;
+mod rounds;
 mod shader;
 mod sky;
 pub mod stream;

@@ -201,6 +201,7 @@ impl Look {
             counts: [1, u32::MAX, 0, self.lights.len() as u32],
             tone: [1.0, 1.0, 1.0, 1.0],
             map_size: [0, 0, TELLING_TURNS, 0],
+            rounds: [0, 0, 0, u32::MAX],
             ..Params::default()
         };
         for (slot, medium) in params.media.iter_mut().zip(&self.media) {

@@ -14,7 +14,7 @@ use crate::upload::Volume;
 pub struct Took {
     /// From submission until it was there.
     pub wall: Duration,
-    /// On the device alone; `None` if that has no timestamps.
+    /// On the device alone; `None` if that has no timestamps, or the picture took more than one submission.
     pub device: Option<Duration>,
 }
 
@@ -27,7 +27,8 @@ pub fn time(gpu: &Gpu, renderer: &mut Renderer, volume: &Volume) -> Result<Took,
     let mut encoder = device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
     if !device.features().contains(wgpu::Features::TIMESTAMP_QUERY) {
         renderer.record(&mut encoder, volume)?;
-        return Ok(Took { wall: submitted(gpu, encoder)?, device: None });
+        let (wall, _) = finished(gpu, encoder, renderer, volume)?;
+        return Ok(Took { wall, device: None });
     }
     let descriptor =
         wgpu::QuerySetDescriptor { label: Some("nuage time"), ty: wgpu::QueryType::Timestamp, count: 2 };
@@ -49,18 +50,28 @@ pub fn time(gpu: &Gpu, renderer: &mut Renderer, volume: &Volume) -> Result<Took,
     let usage = wgpu::BufferUsages::QUERY_RESOLVE | wgpu::BufferUsages::COPY_SRC;
     let resolved = gpu.empty_buffer("nuage time", 16, usage)?;
     encoder.resolve_query_set(&queries, 0..2, &resolved, 0);
-    let wall = submitted(gpu, encoder)?;
+    let (wall, went_on) = finished(gpu, encoder, renderer, volume)?;
+    if went_on {
+        return Ok(Took { wall, device: None });
+    }
     let ticks: Vec<u64> = bytemuck::pod_collect_to_vec(&gpu.read(&resolved)?);
     let period_ns = f64::from(gpu.queue().get_timestamp_period());
     let passed = ticks[1].saturating_sub(ticks[0]) as f64 * period_ns;
     Ok(Took { wall, device: Some(Duration::from_nanos(passed as u64)) })
 }
 
-/// Submits, and waits. Gives the time that took.
-fn submitted(gpu: &Gpu, encoder: wgpu::CommandEncoder) -> Result<Duration, GpuError> {
+/// Submits, waits, and finishes the picture. Gives the time that took, and whether the picture went on in other submissions.
+fn finished(
+    gpu: &Gpu,
+    encoder: wgpu::CommandEncoder,
+    renderer: &mut Renderer,
+    volume: &Volume,
+) -> Result<(Duration, bool), GpuError> {
     let commands = encoder.finish();
     let start = Instant::now();
     gpu.guarded(|| gpu.queue().submit([commands]))?;
     gpu.wait()?;
-    Ok(start.elapsed())
+    let wall = start.elapsed();
+    let went_on = renderer.finish(volume)?;
+    Ok((if went_on { start.elapsed() } else { wall }, went_on))
 }

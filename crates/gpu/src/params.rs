@@ -241,6 +241,7 @@ pub(crate) struct Params {
     pub(crate) map_y: [f32; 4],
     pub(crate) map_z: [f32; 4],
     pub(crate) map_size: [u32; 4],
+    pub(crate) rounds: [u32; 4],
     pub(crate) media: [MediumParams; MAX_MEDIA],
     pub(crate) lights: [LightParams; MAX_LIGHTS],
     pub(crate) blackbody: [[f32; 4]; BLACKBODY_ROWS],
@@ -291,7 +292,7 @@ mod tests {
             Params, "Params", camera forward right up size counts sky_up sky_zenith sky_horizon sky_ground march
             march_rays sun_direction sun_irradiance view tone clip_x clip_y clip_z clip_w marched light_first light_x
             light_y light_z light_u light_v light_w before_camera before_forward before_right before_up history map_x
-            map_y map_z map_size media lights blackbody
+            map_y map_z map_size rounds media lights blackbody
         );
     }
 }

@@ -21,9 +21,14 @@ use crate::light_volume;
 use crate::look::{Look, Medium, MediumPlace, Pass, SHORT_STEP_VOXELS, world_from_clip};
 use crate::params::Params;
 use crate::real_time::Stages;
+use crate::rounds::{BAND_PIXELS, Band, Share, Standing};
 use crate::shader::{Features, Source, UNSOUND, WORKGROUP_SIDE};
 use crate::sky::{sky_group, sky_layout};
 use crate::upload::{Volume, bind, buffer_entry, storage_entry};
+
+const PIXEL_BYTES: u64 = size_of::<[f32; 4]>() as u64;
+const LEFT_LOOPS: &str =
+    "its driver leaves loops that take long; take longer steps, fewer rays or a simpler filter";
 
 /// A host's depth buffer, in front of which the volume ends.
 #[derive(Debug, Clone, Copy)]
@@ -51,7 +56,11 @@ pub struct Renderer {
     gpu: Gpu,
     size: [u32; 2],
     params: wgpu::Buffer,
+    /// Its pixels, and one more that is not 0 where some are to be finished.
     picture: wgpu::Buffer,
+    /// What pictures go on with, once one had to.
+    band: Option<Band>,
+    share: Share,
     /// For compute passes, and for those that show the picture.
     groups: [(wgpu::BindGroupLayout, wgpu::BindGroup); 2],
     depth_layout: wgpu::BindGroupLayout,
@@ -87,10 +96,10 @@ impl Renderer {
     /// If there are no pixels or too many, or the device fails.
     pub fn new(gpu: &Gpu, size: [u32; 2]) -> Result<Renderer, GpuError> {
         let [width, height] = size.map(u64::from);
-        let bytes = 16 * width * height;
+        let bytes = PIXEL_BYTES * (width * height + 1);
         let limits = gpu.device().limits();
         let limit_bytes = limits.max_storage_buffer_binding_size.min(limits.max_buffer_size);
-        if bytes == 0 {
+        if width * height == 0 {
             return Err(GpuError::Misuse("a picture without pixels".to_owned()));
         }
         if bytes > limit_bytes {
@@ -129,6 +138,8 @@ impl Renderer {
             size,
             params,
             picture,
+            band: None,
+            share: Share::default(),
             groups,
             depth_layout,
             depth: None,
@@ -182,7 +193,7 @@ impl Renderer {
         }
         self.prepare_shader(volume, look, pass, frame, None, source_of(pass), true)?;
         self.run(volume)?;
-        let counted: Vec<[f32; 4]> = bytemuck::pod_collect_to_vec(&self.gpu.read(&self.picture)?);
+        let counted = self.read_pixels()?;
         let sum = |i: usize| counted.iter().map(|pixel| pixel[i] as u64).sum();
         Ok(Counts { rays: sum(0), regions: sum(1), values: sum(2) })
     }
@@ -281,7 +292,8 @@ impl Renderer {
         self.gpu.guarded(|| self.gpu.queue().write_buffer(&self.picture, 0, bytes))
     }
 
-    /// The picture on the device, row by row, as four floats for each pixel: to be read by a host's shaders.
+    /// The picture on the device, row by row, as four floats for each pixel, and four that are none: to be read by a host's
+    /// shaders. Pixels of a still picture that is not finished ([`Renderer::finish`]) have an opacity below 0.
     pub fn picture(&self) -> &wgpu::Buffer {
         &self.picture
     }
@@ -310,6 +322,12 @@ impl Renderer {
         self.prepare_shader(volume, look, pass, 0, None, source, false)?;
         self.prepared = self.prepared.take().map(|prepared| Prepared { is_first: false, ..prepared });
         Ok(())
+    }
+
+    /// Sets how much a dispatch of a still picture does.
+    #[cfg(test)]
+    pub(crate) fn set_share(&mut self, share: Share) {
+        self.share = share;
     }
 
     /// Sets the picture.
@@ -413,10 +431,14 @@ impl Renderer {
         let nothing = || GpuError::Misuse("nothing was prepared to be recorded".to_owned());
         let Prepared { key: (source, features), is_first, .. } =
             *self.prepared.as_ref().ok_or_else(nothing)?;
-        // All others write each pixel.
         if is_first && source == Source::Path {
+            // All others write each pixel.
             encoder.clear_buffer(&self.picture, 0, None);
+        } else if goes_on(source, &features) {
+            encoder.clear_buffer(&self.picture, self.pixel_bytes(), None);
         }
+        self.current.rounds = [0, 0, 0, u32::MAX];
+        self.write_params()?;
         let real_time = self.stages.as_mut().filter(|_| features.is_real_time);
         let sources = match real_time {
             Some(stages) => {
@@ -451,15 +473,11 @@ impl Renderer {
                 _ => to_picture,
             };
             pass.set_bind_group(1, target, &[]);
-            let depth = self.depth.as_ref().filter(|_| features.has_depth && *source != Source::LightVolume);
-            if let Some(depth) = depth {
-                pass.set_bind_group(2, depth, &[]);
+            if *source != Source::LightVolume {
+                self.bind_scene(&mut pass, &features);
             }
             if let Some(stages) = stages {
                 pass.set_bind_group(3, stages.group(*source), &[]);
-            }
-            if let Some((_, sky)) = self.sky.as_ref().filter(|_| features.sky_map[0]) {
-                pass.set_bind_group(3, sky, &[]);
             }
             let size = match source {
                 Source::LightVolume => [light_volume::NODES; 2],
@@ -566,39 +584,135 @@ impl Renderer {
         })
     }
 
+    /// Finishes a picture that was recorded and is done, in as many dispatches as that takes: where pixels of the ray marcher or of
+    /// the path tracer take longer than drivers let a dispatch last, it is not whole before. Others are. Of paths, each sample is
+    /// to be finished before the next. Gives whether there was anything to finish.
+    ///
+    /// # Errors
+    /// If the driver leaves loops even where a dispatch does next to nothing, or the device fails.
+    pub fn finish(&mut self, volume: &Volume) -> Result<bool, GpuError> {
+        let Some(Prepared { key: (source, features), .. }) = self.prepared else { return Ok(false) };
+        if !goes_on(source, &features) {
+            return Ok(false);
+        }
+        let key = (if source == Source::Path { Source::PathOn } else { Source::MarchOn }, features);
+        let end = self.pixel_bytes();
+        let said = self.gpu.read_range(&self.picture, end..end + PIXEL_BYTES)?;
+        if said.iter().all(|byte| *byte == 0) {
+            return Ok(false);
+        }
+        if !self.pipelines.contains_key(&key) {
+            let pipeline = self.pipeline(volume, key.0, &key.1)?;
+            self.pipelines.insert(key, pipeline);
+        }
+        let band = match self.band.take() {
+            Some(band) => band,
+            None => {
+                let [(pass_layout, _), _] = &self.groups;
+                Band::new(&self.gpu, pass_layout, &self.params)?
+            }
+        };
+        let pixels = self.size[0] * self.size[1];
+        let mut look_ups = self.share.look_ups;
+        for first in (0..pixels).step_by(BAND_PIXELS as usize) {
+            let count = BAND_PIXELS.min(pixels - first);
+            let mut encoder = self.encoder();
+            band.begin(&mut encoder, &self.picture, first, count);
+            loop {
+                self.current.rounds = [first, count, look_ups, 0];
+                self.write_params()?;
+                band.record(&mut encoder, count.div_ceil(WORKGROUP_SIDE * WORKGROUP_SIDE), |pass| {
+                    pass.set_pipeline(&self.pipelines[&key]);
+                    pass.set_bind_group(0, volume.bind_group(), &[]);
+                    self.bind_scene(pass, &key.1);
+                });
+                let begun = std::mem::replace(&mut encoder, self.encoder());
+                self.gpu.guarded(|| self.gpu.queue().submit([begun.finish()]))?;
+                let Standing { is_unfinished, is_unsound } = band.standing(&self.gpu)?;
+                if !is_unfinished {
+                    break;
+                }
+                if is_unsound && look_ups <= 1 {
+                    return Err(GpuError::Device(LEFT_LOOPS.to_owned()));
+                }
+                look_ups >>= u32::from(is_unsound);
+            }
+            band.end(&mut encoder, &self.picture, first, count);
+            self.gpu.guarded(|| self.gpu.queue().submit([encoder.finish()]))?;
+        }
+        self.band = Some(band);
+        self.gpu.wait()?;
+        Ok(true)
+    }
+
+    /// Binds what a pass reads of a scene beside the volume.
+    fn bind_scene(&self, pass: &mut wgpu::ComputePass<'_>, features: &Features) {
+        if let Some(depth) = self.depth.as_ref().filter(|_| features.has_depth) {
+            pass.set_bind_group(2, depth, &[]);
+        }
+        if let Some((_, sky)) = self.sky.as_ref().filter(|_| features.sky_map[0]) {
+            pass.set_bind_group(3, sky, &[]);
+        }
+    }
+
+    fn encoder(&self) -> wgpu::CommandEncoder {
+        self.gpu.device().create_command_encoder(&wgpu::CommandEncoderDescriptor::default())
+    }
+
+    /// The bytes of the picture's pixels.
+    fn pixel_bytes(&self) -> u64 {
+        self.picture.size() - PIXEL_BYTES
+    }
+
+    fn read_pixels(&self) -> Result<Vec<[f32; 4]>, GpuError> {
+        Ok(bytemuck::pod_collect_to_vec(&self.gpu.read_range(&self.picture, 0..self.pixel_bytes())?))
+    }
+
     /// Runs what was prepared, and waits for it.
     ///
     /// # Errors
-    /// If nothing was prepared, or the device fails.
+    /// If nothing was prepared, or as [`Renderer::finish`].
     pub fn run(&mut self, volume: &Volume) -> Result<(), GpuError> {
-        let mut encoder =
-            self.gpu.device().create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
+        let mut encoder = self.encoder();
         self.record(&mut encoder, volume)?;
+        if let Some(Prepared { key: (source, features), .. }) = &self.prepared
+            && goes_on(*source, features)
+        {
+            self.current.rounds[3] = self.share.rays;
+            self.write_params()?;
+        }
         let start = Instant::now();
         self.gpu.guarded(|| self.gpu.queue().submit([encoder.finish()]))?;
         self.gpu.wait()?;
         if self.prepared.as_ref().is_some_and(|prepared| prepared.key.1.is_real_time) {
             self.took(start.elapsed().as_secs_f32() * 1e3);
         }
-        Ok(())
+        self.finish(volume).map(drop)
     }
 
     /// The picture, row by row: colour times opacity, and opacity; of paths their mean.
     ///
     /// # Errors
-    /// If the device fails. Lavapipe, which leaves loops after some 65,000 turns in all, is found out where a picture asks for
-    /// more; of pictures that follow each other it is not.
+    /// If the device fails, or a still picture was recorded and is not finished. Lavapipe, which leaves loops after some 65,000
+    /// turns in all, is found out where a ray of a view or a shadow takes more; of pictures that follow each other it is not.
     pub fn pixels(&self) -> Result<Vec<[f32; 4]>, GpuError> {
-        let bytes = self.gpu.read(&self.picture)?;
-        let floats: Vec<[f32; 4]> = bytemuck::pod_collect_to_vec(&bytes);
+        let floats = self.read_pixels()?;
         if floats.iter().any(|pixel| pixel[3] <= UNSOUND) {
-            let what =
-                "its driver leaves loops that take long; take longer steps, fewer rays or a simpler filter";
-            return Err(GpuError::Device(what.to_owned()));
+            return Err(match &self.prepared {
+                Some(Prepared { key: (source, features), .. }) if goes_on(*source, features) => {
+                    GpuError::Misuse("the picture takes more than was recorded: finish it".to_owned())
+                }
+                _ => GpuError::Device(LEFT_LOOPS.to_owned()),
+            });
         }
         let share = self.current.tone[1];
         Ok(floats.into_iter().map(|pixel| pixel.map(|value| value * share)).collect())
     }
+}
+
+/// Whether further dispatches go on with pictures that take long.
+fn goes_on(source: Source, features: &Features) -> bool {
+    matches!(source, Source::March | Source::Path) && !features.is_real_time && !features.counts
 }
 
 /// What the shader of a pass must be able to do.

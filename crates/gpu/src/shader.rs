@@ -23,7 +23,7 @@ use crate::hdda::{ADD_VOXELS, Layer, MEET_VOXEL, PASS_SAMPLES, PASS_VOXELS};
 use crate::maps::{self, ABSENT_TAG};
 use crate::params::{self, Field, MAX_LIGHTS, MAX_MEDIA};
 use crate::upload::FIRST_TEXTURE;
-use crate::{blue_noise, light_volume, real_time};
+use crate::{blue_noise, light_volume, real_time, rounds};
 
 /// Pixels along each side of a workgroup.
 pub(crate) const WORKGROUP_SIDE: u32 = 8;
@@ -31,8 +31,9 @@ pub(crate) const WORKGROUP_SIDE: u32 = 8;
 /// would keep a device busy until its driver takes it for lost.
 const MAX_DRAWS: u32 = 1 << 20;
 const MAX_LEAPS: u32 = 1 << 16;
-/// The opacity of a pixel that cannot be known, since the driver left loops before their end.
-pub(crate) const UNSOUND: f32 = f32::MIN;
+/// The opacity from which on a pixel is marked: it is not known yet, or cannot be since the driver left loops before their end.
+/// A power of two, so that what is multiplied by it comes back.
+pub(crate) const UNSOUND: f32 = -((1_u128 << 100) as f32);
 /// The turns of the loop that tells, which a loop that is left after one does not take.
 pub(crate) const TELLING_TURNS: u32 = 2;
 /// The words in front of the arrays of trees that say where each begins.
@@ -202,8 +203,12 @@ pub(crate) enum Source {
     Surface,
     /// The ray marcher.
     March,
+    /// The ray marcher, a share of its work at a time.
+    MarchOn,
     /// The path tracer.
     Path,
+    /// The path tracer, a share of its work at a time.
+    PathOn,
     /// The light volume.
     LightVolume,
     /// From pictures of a quarter of the pixels to all of them.
@@ -250,7 +255,9 @@ impl Source {
             Source::Views => "views",
             Source::Surface => "surface",
             Source::March => "march",
+            Source::MarchOn => "march_on",
             Source::Path => "path",
+            Source::PathOn => "path_on",
             Source::LightVolume => "light_volume",
             Source::Upsample => "upsample",
             Source::Accumulate => "accumulate",
@@ -277,7 +284,11 @@ impl Source {
         text += picture;
         text += &brick_words(features);
         text += &block_texels(features);
-        text += if features.counts { file!("count") } else { file!("no_count") };
+        text += match self {
+            Source::MarchOn | Source::PathOn => file!("share"),
+            _ if features.counts => file!("count"),
+            _ => file!("no_count"),
+        };
         COMMON.iter().for_each(|part| text += part);
         let end = if features.has_depth { file!("depth_end") } else { file!("open_end") };
         let kind = if features.is_real_time { file!("real_time") } else { file!("still") };
@@ -295,6 +306,17 @@ impl Source {
             &voxel_depth,
             file!("march"),
         ];
+        let tracing = [
+            file!("camera"),
+            file!("emission"),
+            end,
+            file!("light"),
+            sky_map,
+            file!("solid"),
+            file!("track"),
+            media,
+            file!("path"),
+        ];
         let own: &[&str] = match self {
             Source::Views => &[
                 file!("camera"),
@@ -308,21 +330,13 @@ impl Source {
             ],
             Source::Surface => &[file!("camera"), file!("cells"), file!("surface")],
             Source::March => &marching,
+            Source::MarchOn => &[&marching[..], &[file!("band"), file!("march_on")]].concat(),
             Source::Shadow => &[&marching[..], &[file!("shadow")]].concat(),
             Source::LightVolume => &[file!("camera"), file!("light_volume")],
             Source::Upsample => &[file!("camera"), end, file!("upsample")],
             Source::Accumulate => &[file!("camera"), end, file!("accumulate")],
-            Source::Path => &[
-                file!("camera"),
-                file!("emission"),
-                end,
-                file!("light"),
-                sky_map,
-                file!("solid"),
-                file!("track"),
-                media,
-                file!("path"),
-            ],
+            Source::Path => &tracing,
+            Source::PathOn => &[&tracing[..], &[file!("band"), file!("path_on")]].concat(),
             Source::Tone => &[],
             #[cfg(test)]
             Source::Twins => &[file!("twins")],
@@ -660,6 +674,7 @@ fn prelude(features: &Features) -> String {
     // What is accumulated would not forget.
     p.b("CHECKS_LOOPS", !features.is_real_time && !features.counts);
     p.f("UNSOUND", UNSOUND);
+    p.u("BAND_PIXELS", rounds::BAND_PIXELS);
     for (i, name) in [
         "VIEW_DENSITY",
         "VIEW_DEPTH",
@@ -696,7 +711,9 @@ mod tests {
             Source::Views,
             Source::Surface,
             Source::March,
+            Source::MarchOn,
             Source::Path,
+            Source::PathOn,
             Source::LightVolume,
             Source::Upsample,
             Source::Accumulate,

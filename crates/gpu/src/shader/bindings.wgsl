@@ -103,6 +103,9 @@ struct Params {
     map_y: vec4<f32>,
     map_z: vec4<f32>,
     map_size: vec4<u32>,
+    // Of a band of pixels the first and how many there are, the look-ups of each in one dispatch, and the most shadow rays or
+    // scatterings of a pixel in a picture's first.
+    rounds: vec4<u32>,
     media: array<Medium, MAX_MEDIA>,
     lights: array<Light, MAX_LIGHTS>,
     // Of black bodies by their temperature: colour of luminance 1, and the logarithm of the luminance.

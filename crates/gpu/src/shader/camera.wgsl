@@ -44,14 +44,30 @@ fn leaves_loops() -> bool {
     return turns < params.map_size.z;
 }
 
-// What a pixel is to show, with an opacity that no light has where it cannot be known.
-fn sound(value: vec4<f32>) -> vec4<f32> {
-    if (CHECKS_LOOPS && leaves_loops()) {
-        return vec4<f32>(0.0, 0.0, 0.0, UNSOUND);
-    }
-    return value;
+// What a pixel showed before something that cannot be known yet, with an opacity that no light has; and that back again.
+fn marked(before: vec4<f32>) -> vec4<f32> {
+    return vec4<f32>(before.xyz, (before.w + 1.0) * UNSOUND);
+}
+
+fn unmarked(value: vec4<f32>) -> vec4<f32> {
+    return vec4<f32>(value.xyz, value.w / UNSOUND - 1.0);
+}
+
+fn is_marked(value: vec4<f32>) -> bool {
+    return value.w <= UNSOUND;
 }
 
 fn store(pixel: vec2<u32>, value: vec4<f32>) {
-    picture[pixel.y * params.size.x + pixel.x] = shown(sound(value));
+    let is_sound = !(CHECKS_LOOPS && leaves_loops());
+    picture[pixel.y * params.size.x + pixel.x] = select(marked(vec4<f32>(0.0)), shown(value), is_sound);
+}
+
+// As `store`, of a pixel of so many that others can go on with: behind the last is said whether there is one.
+fn store_or_mark(number: u32, before: vec4<f32>, value: vec4<f32>, is_finished: bool) {
+    if (CHECKS_LOOPS && (!is_finished || leaves_loops())) {
+        picture[number] = marked(before);
+        picture[arrayLength(&picture) - 1u] = vec4<f32>(1.0);
+        return;
+    }
+    picture[number] = shown(value);
 }

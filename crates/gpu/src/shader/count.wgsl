@@ -9,3 +9,10 @@ fn count_value() { counted.z += 1u; }
 fn shown(value: vec4<f32>) -> vec4<f32> {
     return vec4<f32>(vec3<f32>(counted), 0.0);
 }
+
+// Whether a dispatch has done its share and others go on: never.
+const GOES_ON: bool = false;
+
+fn is_spent() -> bool {
+    return false;
+}

@@ -1,24 +1,41 @@
 // Line integrals: nuage_render::depth.
 
 // The integral of the interpolated field along a ray from 0 to `end`. Exact but for rounding: in a cell it is a cubic along the ray, which
-// Gauss' rule of two points integrates exactly.
-fn line_integral(field: u32, local: LocalRay, end: f32) -> f32 {
+// Gauss' rule of two points integrates exactly. It is not known yet where a passage is left.
+fn line_integral(field: u32, local: LocalRay, end: f32, passage: ptr<function, Passage>) -> f32 {
     var sum = 0.0;
     var accessor = new_accessor();
     var runs = runs_between(field, local, 0.0, end);
+    var left = FoundRun(false, Run(0.0, 0.0, true, 0.0));
+    var brick = vec3<f32>(0.0);
+    if (GOES_ON && (*passage).is_there) {
+        runs = resumed(field, local, (*passage).walk);
+        left = (*passage).left;
+        brick = (*passage).brick;
+        sum = (*passage).sum;
+        (*passage).is_there = false;
+    }
     loop {
-        let found = next_run(&runs, &accessor);
+        if (is_spent()) {
+            *passage = Passage(true, walk_of(runs), left, brick, sum);
+            break;
+        }
+        var found = left;
+        if (!GOES_ON || !left.is_there) {
+            found = next_run(&runs, &accessor);
+            // From brick to brick by whole numbers, so that rounding never holds the ray up at a face.
+            brick = floor(ray_at(local, found.run.t0) / BRICK_SIDE);
+        }
         if (!found.is_there) {
             break;
         }
+        left.is_there = false;
         if (!found.run.is_varying) {
             sum += found.run.value * (found.run.t1 - found.run.t0);
             continue;
         }
-        // From brick to brick by whole numbers, so that rounding never holds the ray up at a face.
         var t = found.run.t0;
-        var brick = floor(ray_at(local, t) / BRICK_SIDE);
-        while (t < found.run.t1) {
+        while (t < found.run.t1 && !is_spent()) {
             let corner = brick * BRICK_SIDE;
             let far = select(corner, corner + BRICK_SIDE, local.direction >= vec3<f32>(0.0));
             let is_still = local.direction == vec3<f32>(0.0);
@@ -42,6 +59,9 @@ fn line_integral(field: u32, local: LocalRay, end: f32) -> f32 {
             let is_x = faces.x <= leaves;
             let is_y = !is_x && faces.y <= leaves;
             brick += select(vec3<f32>(0.0), sign(local.direction), vec3<bool>(is_x, is_y, !(is_x || is_y)));
+        }
+        if (GOES_ON) {
+            left = FoundRun(t < found.run.t1, Run(t, found.run.t1, true, 0.0));
         }
     }
     return sum;

@@ -52,18 +52,6 @@ fn with_step(group: SkyGroup, step: vec2<f32>, share: f32) -> SkyGroup {
     return SkyGroup(sum, group.t, (group.random - part) / (1.0 - part));
 }
 
-// Where a walk stands.
-struct Walk { brick: vec3<i32>, t: f32, t_end: f32 }
-
-fn walk_of(runs: Runs) -> Walk {
-    return Walk(runs.brick, runs.t, runs.t_end);
-}
-
-// Goes on with a walk; its leaps are counted from here on.
-fn resumed(field: u32, ray: LocalRay, walk: Walk) -> Runs {
-    return Runs(field, ray, walk.brick, walk.t, walk.t_end, MAX_ROOT_LEAPS, MAX_LEAPS);
-}
-
 // How far a camera ray has got: what is kept while a shadow ray is followed. All else is made anew from the pixel, so that
 // registers are free for the shadow ray.
 struct Progress {
@@ -161,6 +149,9 @@ fn next_shadow_ray(progress: ptr<function, Progress>, ray: Ray, max_distance: f3
     let full_sky = 1.0 / max(params.march_rays.y, 1.0);
     var t = 0.0;
     loop {
+        if (is_spent()) {
+            break;
+        }
         var is_over = false;
         var is_sky_due = has_sky && now.taken + now.share > now.next_sky;
         if (GROUPS_SKY) {
@@ -310,17 +301,34 @@ fn sky_direction(view: vec3<f32>, random: u32, index: u32) -> vec3<f32> {
     return sample_phase(params.media[0].phase, view, u);
 }
 
-// The optical depth of a ray up to `end`, given up once it passes `limit`.
-fn optical_depth(field: u32, ray: LocalRay, end: f32, lattice: Lattice, scale: f32, limit: f32) -> f32 {
+// The optical depth of a ray up to `end`, given up once it passes `limit`. It is not known yet where a passage is left.
+fn optical_depth(
+    field: u32, ray: LocalRay, end: f32, lattice: Lattice, scale: f32, limit: f32, passage: ptr<function, Passage>,
+) -> f32 {
     var depth = 0.0;
     let seed = hash_u32(bitcast<u32>(lattice.shift));
     var accessor = new_accessor();
     var runs = runs_between(field, ray, 0.0, end);
+    var left = FoundRun(false, Run(0.0, 0.0, true, 0.0));
+    if (GOES_ON && (*passage).is_there) {
+        runs = resumed(field, ray, (*passage).walk);
+        left = (*passage).left;
+        depth = (*passage).sum;
+        (*passage).is_there = false;
+    }
     loop {
-        let found = next_run(&runs, &accessor);
+        if (is_spent()) {
+            *passage = Passage(true, walk_of(runs), left, vec3<f32>(0.0), depth);
+            break;
+        }
+        var found = left;
+        if (!GOES_ON || !left.is_there) {
+            found = next_run(&runs, &accessor);
+        }
         if (!found.is_there) {
             break;
         }
+        left.is_there = false;
         if (found.run.is_varying) {
             var steps = steps_between(lattice, found.run.t0, found.run.t1);
             loop {
@@ -331,9 +339,12 @@ fn optical_depth(field: u32, ray: LocalRay, end: f32, lattice: Lattice, scale: f
                 let t = 0.5 * (step.x + step.y);
                 let value = look_up(LOOKUP, field, &accessor, ray_at(ray, t), three(seed ^ bitcast<u32>(t)));
                 depth += value * scale * (step.y - step.x);
-                if (depth > limit) {
+                if (depth > limit || is_spent()) {
                     break;
                 }
+            }
+            if (GOES_ON) {
+                left = FoundRun(steps.t0 < steps.end, Run(steps.t0, steps.end, true, 0.0));
             }
         } else {
             depth += found.run.value * scale * (found.run.t1 - found.run.t0);
@@ -346,28 +357,29 @@ fn optical_depth(field: u32, ray: LocalRay, end: f32, lattice: Lattice, scale: f
 }
 
 // The share of the light from the direction of a ray that gets to where it begins, without steps.
-fn exact_transmittance(field: u32, ray: LocalRay) -> f32 {
+fn exact_transmittance(field: u32, ray: LocalRay, passage: ptr<function, Passage>) -> f32 {
     var depth: f32;
     if (MEAN_LOOKUP == LOOKUP_NEAREST) {
         depth = voxel_integral(field, ray);
     } else {
-        depth = line_integral(field, ray, field_exit(field, ray));
+        depth = line_integral(field, ray, field_exit(field, ray), passage);
     }
     return exp_(-params.media[0].extinction.x * depth);
 }
 
-// The light from the end of a shadow ray that gets to where it begins, and from there to the camera.
-fn light_through(shadow: ShadowRay) -> vec3<f32> {
+// The light from the end of a shadow ray that gets to where it begins, and from there to the camera. It is not known yet where a
+// passage is left.
+fn light_through(shadow: ShadowRay, passage: ptr<function, Passage>) -> vec3<f32> {
     let field = field_of(SHADOW_CHANNEL);
     var passes: f32;
     if (HAS_EXACT_SHADOWS) {
-        passes = exact_transmittance(field, shadow.ray);
+        passes = exact_transmittance(field, shadow.ray, passage);
     } else {
         let step = params.march.y / length(shadow.ray.direction);
         let lattice = Lattice(step, shadow.shift, params.march.z / step);
         let end = field_exit(field, shadow.ray);
         let scale = params.media[0].extinction.x;
-        passes = exp_(-optical_depth(field, shadow.ray, end, lattice, scale, params.march_rays.z));
+        passes = exp_(-optical_depth(field, shadow.ray, end, lattice, scale, params.march_rays.z, passage));
     }
     let colour = select(params.sun_irradiance.xyz, params.sky_zenith.xyz, shadow.is_to_sky);
     return colour * params.media[0].albedo.xyz * (shadow.worth * passes);
@@ -392,21 +404,24 @@ fn march(@builtin(global_invocation_id) id: vec3<u32>) {
     let samples = max(params.counts.x, 1u);
     var progress: Progress;
     var opacity = 0.0;
-    for (var i = 0u; i < samples; i++) {
+    var rays_left = params.rounds.w;
+    for (var i = 0u; i < samples && rays_left > 0u; i++) {
         progress.has_begun = false;
         loop {
             let pixel = pixel_of_marched(id.xy);
             let ray = camera_ray(vec2<f32>(pixel) + pixel_offset(pixel, i, samples));
             let random = hash_pixel(pixel.x, pixel.y, i + samples * params.marched.w, 2u);
             let shadow = next_shadow_ray(&progress, ray, end_of(pixel, ray), random, step_shift(id.xy, random));
-            if (!shadow.is_there) {
+            if (!shadow.is_there || rays_left == 0u) {
                 break;
             }
-            progress.scattered += light_through(shadow);
+            var passage: Passage;
+            progress.scattered += light_through(shadow, &passage);
+            rays_left -= 1u;
         }
         opacity += 1.0 - progress.transmittance;
     }
     keep_depth(id.xy, progress.depth_moment / max(opacity, MIN_F32));
     let mean = vec4<f32>(progress.scattered, opacity) / f32(samples);
-    picture[id.y * params.marched.x + id.x] = shown(sound(mean));
+    store_or_mark(id.y * params.marched.x + id.x, vec4<f32>(0.0), mean, rays_left > 0u);
 }

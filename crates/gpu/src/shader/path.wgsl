@@ -41,15 +41,33 @@ fn light_at(
     return arrives.light * scatters * transmittance(Ray(at, direction), limit, random);
 }
 
-// The light that one path finds along a ray, and whether it met the medium.
-fn path_light(first: Ray, limit: f32, seed: u32) -> vec4<f32> {
-    var random = Random(seed, 0u);
-    var carried = Carried(vec3<f32>(1.0), vec3<f32>(1.0));
-    var light = vec3<f32>(0.0);
-    var ray = first;
-    var scatterings = 0u;
-    var met = 0.0;
-    loop {
+// A path as far as it is known: where it goes on, what it is worth there, the light that it found, how often it was scattered,
+// and whether it met the medium.
+struct Path {
+    is_over: bool,
+    ray: Ray,
+    carried: Carried,
+    light: vec3<f32>,
+    scatterings: u32,
+    met: f32,
+    random: Random,
+}
+
+fn new_path(ray: Ray, seed: u32) -> Path {
+    let carried = Carried(vec3<f32>(1.0), vec3<f32>(1.0));
+    return Path(false, ray, carried, vec3<f32>(0.0), 0u, 0.0, Random(seed, 0u));
+}
+
+// Follows a path to its end, or until a dispatch has done its share. The camera sees as far as `limit`.
+fn follow(path: ptr<function, Path>, limit: f32) {
+    var random = (*path).random;
+    var carried = (*path).carried;
+    var light = (*path).light;
+    var ray = (*path).ray;
+    var scatterings = (*path).scatterings;
+    var met = (*path).met;
+    var is_over = false;
+    while (!is_spent() && (GOES_ON || scatterings < params.rounds.w)) {
         let is_far = scatterings > 0u;
         let collision = fly(ray, select(limit, MAX_F32, is_far), is_far, &carried, &light, &random);
         let distance = collision.distance;
@@ -58,10 +76,12 @@ fn path_light(first: Ray, limit: f32, seed: u32) -> vec4<f32> {
             if (is_far && !HAS_SKY_RAYS) {
                 light += carried.weight * carried.colours * sky_radiance(ray.direction);
             }
+            is_over = true;
             break;
         }
         met = 1.0;
         if (scatterings >= params.counts.y || has_drawn_enough(&random)) {
+            is_over = true;
             break;
         }
         let phase = params.media[collision.medium].phase;
@@ -70,6 +90,7 @@ fn path_light(first: Ray, limit: f32, seed: u32) -> vec4<f32> {
         let chance = max_component(carried.weight * carried.colours) / ROULETTE_WEIGHT;
         if (chance < 1.0) {
             if (random_unit(&random) >= chance) {
+                is_over = true;
                 break;
             }
             carried.weight /= chance;
@@ -85,20 +106,32 @@ fn path_light(first: Ray, limit: f32, seed: u32) -> vec4<f32> {
         let u = vec2<f32>(random_unit(&random), random_unit(&random));
         ray = Ray(at, sample_phase(phase, ray.direction, u));
     }
-    return vec4<f32>(light, met);
+    *path = Path(is_over, ray, carried, light, scatterings, met, random);
 }
 
-// Adds a path, the number of which is `params.size.w`, to the sums of the picture.
+// Where the camera ray of a path, the number of which is `params.size.w`, goes through a pixel.
+fn path_ray(pixel: vec2<u32>) -> Ray {
+    let number = params.size.w;
+    let offset = vec2<f32>(
+        unit_f32(hash_pixel(pixel.x, pixel.y, number, 0u)), unit_f32(hash_pixel(pixel.x, pixel.y, number, 1u)),
+    );
+    return camera_ray(vec2<f32>(pixel) + offset);
+}
+
+fn path_seed(pixel: vec2<u32>) -> u32 {
+    return hash_pixel(pixel.x, pixel.y, params.size.w, 2u);
+}
+
+// Adds a path to the sums of the picture.
 @compute @workgroup_size(WORKGROUP_SIDE, WORKGROUP_SIDE)
 fn path(@builtin(global_invocation_id) id: vec3<u32>) {
     if (any(id.xy >= params.size.xy)) {
         return;
     }
-    let number = params.size.w;
-    let offset = vec2<f32>(
-        unit_f32(hash_pixel(id.x, id.y, number, 0u)), unit_f32(hash_pixel(id.x, id.y, number, 1u)),
-    );
-    let ray = camera_ray(vec2<f32>(id.xy) + offset);
-    let light = path_light(ray, end_of(id.xy, ray), hash_pixel(id.x, id.y, number, 2u));
-    store(id.xy, picture[id.y * params.size.x + id.x] + light);
+    let ray = path_ray(id.xy);
+    var path = new_path(ray, path_seed(id.xy));
+    follow(&path, end_of(id.xy, ray));
+    let number = id.y * params.size.x + id.x;
+    let before = picture[number];
+    store_or_mark(number, before, before + vec4<f32>(path.light, path.met), path.is_over);
 }

@@ -9,12 +9,14 @@ fn sun_transmittance(p_world: vec3<f32>) -> f32 {
         return 1.0;
     }
     let ray = moved(field, Ray(p_world, direction), span.x);
+    var passage: Passage;
     if (HAS_EXACT_SHADOWS) {
-        return exact_transmittance(field, ray);
+        return exact_transmittance(field, ray, &passage);
     }
     let step = params.march.y / length(ray.direction);
     let lattice = Lattice(step, 0.5, params.march.z / step);
-    let depth = optical_depth(field, ray, span.y - span.x, lattice, params.media[0].extinction.x, params.march_rays.z);
+    let scale = params.media[0].extinction.x;
+    let depth = optical_depth(field, ray, span.y - span.x, lattice, scale, params.march_rays.z, &passage);
     return exp_(-depth);
 }
 

@@ -113,7 +113,8 @@ fn whole_integral(field: u32, ray: Ray) -> f32 {
     if (span.x >= span.y) {
         return 0.0;
     }
-    return line_integral(field, moved(field, ray, span.x), span.y - span.x);
+    var passage: Passage;
+    return line_integral(field, moved(field, ray, span.x), span.y - span.x, &passage);
 }
 
 fn view_colour(hit: VoxelHit, field: u32) -> vec3<f32> {

@@ -271,3 +271,19 @@ fn next_run(runs: ptr<function, Runs>, accessor: ptr<function, Accessor>) -> Fou
     }
     return found;
 }
+
+// Where a walk stands.
+struct Walk { brick: vec3<i32>, t: f32, t_end: f32 }
+
+fn walk_of(runs: Runs) -> Walk {
+    return Walk(runs.brick, runs.t, runs.t_end);
+}
+
+// Goes on with a walk; its leaps are counted from here on.
+fn resumed(field: u32, ray: LocalRay, walk: Walk) -> Runs {
+    return Runs(field, ray, walk.brick, walk.t, walk.t_end, MAX_ROOT_LEAPS, MAX_LEAPS);
+}
+
+// How far a sum along a ray has got where a dispatch had done its share: its walk, what is left of the run it is in, the brick of
+// that where it takes bricks one by one, and the sum so far.
+struct Passage { is_there: bool, walk: Walk, left: FoundRun, brick: vec3<f32>, sum: f32 }
