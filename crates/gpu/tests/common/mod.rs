@@ -5,7 +5,6 @@
 #![allow(unreachable_pub, reason = "a module of test binaries, not of a library")]
 #![allow(clippy::print_stdout, reason = "the measured errors are worth reading")]
 
-pub mod matrix;
 pub mod paths;
 
 use std::convert::Infallible;

@@ -2,18 +2,20 @@
 
 #![allow(clippy::print_stdout, reason = "the measured errors are worth reading")]
 
+mod cells;
+#[path = "../common/mod.rs"]
 mod common;
 
-use common::gpu;
 use std::time::Instant;
 
-use common::matrix::{ALL_PARTS, Form, Matrix, Pair, Part, SMALL, Subject, forms, hold, pairs, subjects};
+use cells::{ALL_PARTS, Form, Matrix, Pair, Part, SMALL, Shown, Subject, forms, hold, pairs, subjects};
+use common::gpu;
 use nuage_gpu::device::Gpu;
 use nuage_gpu::renderer::Renderer;
 use nuage_render::filter::{Filter, Lookup};
 
 /// Files whose volumes are small and differ in kind.
-const SMALL_FILES: [&str; 23] = [
+const SMALL_FILES: [&str; 24] = [
     "oracle/oracle_64.vdb",
     "data/samples/blast.0001.vdb",
     "data/samples/blast.0008.vdb",
@@ -33,6 +35,7 @@ const SMALL_FILES: [&str; 23] = [
     "data/edge/lower_tiles_only.vdb",
     "data/edge/metadata_all.vdb",
     "data/edge/py10_mixed.vdb",
+    "data/edge/special_values.vdb",
     "data/edge/single_voxel_m1.vdb",
     "data/edge/transforms.vdb",
     "data/edge/classes.vdb",
@@ -53,7 +56,7 @@ const WIDE_FILES: [&str; 9] = [
 ];
 
 /// The same volumes as others in other files, and those of sequences.
-const LIKE_FILES: [&str; 40] = [
+const LIKE_FILES: [&str; 41] = [
     "data/public/openusd_smoke_000001.vdb",
     "data/public/openusd_smoke_000003.vdb",
     "data/sequences/chimney/fluid_data_0001.vdb",
@@ -91,6 +94,7 @@ const LIKE_FILES: [&str; 40] = [
     "data/edge/half_none.vdb",
     "data/edge/leaf_masks_zip.vdb",
     "data/edge/single_voxel_0.vdb",
+    "data/edge/special_values_none.vdb",
     "data/edge/transforms_none.vdb",
     "data/edge/types_bloscmask.vdb",
     "data/edge/tiles_levels_none.vdb",
@@ -151,9 +155,10 @@ impl Bench {
     fn hold(&mut self, form: usize, subjects: &[&Subject], parts: &[Part]) {
         let pairs: Vec<Pair> =
             subjects.iter().flat_map(|subject| pairs(&self.gpu, subject, &self.forms[form])).collect();
+        let shown: Vec<Shown<'_>> = pairs.iter().filter_map(Pair::shown).collect();
         for part in parts {
-            for pair in &pairs {
-                hold(&mut self.matrix, &mut self.renderer, pair, *part);
+            for shown in &shown {
+                hold(&mut self.matrix, &mut self.renderer, shown, *part);
             }
         }
     }
@@ -171,13 +176,16 @@ impl Bench {
 fn the_whole_matrix_is_that_of_the_cpu() {
     let Some(mut bench) = Bench::new() else { return };
     let start = Instant::now();
-    let load = |files: &[&str]| -> Vec<Subject> { files.iter().flat_map(|file| subjects(file)).collect() };
+    let wanted = |variable: &str, name: &str| {
+        std::env::var(variable).map_or(true, |names| names.split(',').any(|wanted| wanted == name))
+    };
+    let is_wanted = |file: &&&str| wanted("NUAGE_VOLUMES", file.rsplit(['/']).next().unwrap_or(file).trim_end_matches(".vdb"));
+    let load = |files: &[&str]| -> Vec<Subject> { files.iter().filter(is_wanted).flat_map(|file| subjects(file)).collect() };
     let whole = load(&[&SMALL_FILES[..], &WIDE_FILES[..]].concat());
     let in_turn = load(&[&LIKE_FILES[..], &LARGE_FILES[..]].concat());
     let unlike = bench.named(&UNLIKE_FORMS);
-    let wanted = std::env::var("NUAGE_FORMS").unwrap_or_default();
     for form in 0..bench.forms.len() {
-        if !wanted.is_empty() && !wanted.split(',').any(|name| name == bench.forms[form].name) {
+        if !wanted("NUAGE_FORMS", &bench.forms[form].name) {
             continue;
         }
         let step = if unlike.contains(&form) { 1 } else { 3 };
