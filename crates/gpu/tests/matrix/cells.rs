@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::time::Instant;
 
 use glam::{DVec2, DVec3, IVec3};
-use nuage_gpu::arrays::{self, Arrays, Meaning, Wanted};
+use nuage_gpu::arrays::{Arrays, Bricks, Meaning, Wanted};
 use nuage_gpu::device::Gpu;
 use nuage_gpu::error::GpuError;
 use nuage_gpu::look::{Look, Pass};
@@ -13,35 +13,27 @@ use nuage_gpu::upload::Volume as GpuVolume;
 use nuage_pipeline::import::{import, import_surface, is_level_set};
 use nuage_pipeline::pack::options::{Bound, Options};
 use nuage_pipeline::select::is_drawable;
-use nuage_render::camera::{Camera, Ray};
 use nuage_render::depth::stepped_transmittance;
 use nuage_render::filter::{Filter, Lookup};
 use nuage_render::framing::{WorldBox, fit_camera, fit_density_scale};
-use nuage_render::hash::{hash_pixel, hash_u32, unit_f32};
 use nuage_render::light::Sun;
-use nuage_render::march::{Marcher, Quality};
+use nuage_render::march::Quality;
+use nuage_render::path::PathSettings;
 use nuage_render::scene::{Phase, Scene, Shape, Volume};
-use nuage_render::surface::{SurfaceHit, first_hit, first_voxel};
+use nuage_render::surface::{SurfaceHit, VoxelHit, first_hit, first_voxel};
 use nuage_render::traverse::Field;
 use nuage_render::views::{View, render_view};
 use nuage_vdb::Grid;
-use nuage_volume::accessor::Accessor;
-use nuage_volume::brick::{BrickSummary, Bricks};
-use nuage_volume::build::{TileSize, TreeBuilder};
 use nuage_volume::channel::Channel;
 use nuage_volume::codec::Codec;
 use nuage_volume::codec::block::{BlockFormat, PackingAxis};
-use nuage_volume::format::Asset;
-use nuage_volume::packed::{self, mask};
-use nuage_volume::space::{
-    BRICK_VOXELS, LOG2_NODE4_BRICKS, LOG2_NODE5_BRICKS, NODE4_SLOTS, NODE5_SLOTS, node4_slot_brick,
-    node5_slot_brick,
-};
-use nuage_volume::tree::Content;
 
-use crate::common::{differences, is_same_hit, packed as pack, unpacked_as};
+use crate::common::paths::compare_on;
+use crate::common::{differences, is_same_hit, packed, unpacked_as};
+use crate::reference::in_packed_tree;
 
 /// What is looked at, by name.
+#[derive(Clone)]
 pub(crate) struct Subject {
     pub name: String,
     pub grid: Grid,
@@ -52,43 +44,43 @@ pub(crate) struct Form {
     pub name: String,
     /// How they are packed; `None` for a channel that never was.
     pub options: Option<Options>,
-    pub bricks: arrays::Bricks,
+    pub bricks: Bricks,
 }
 
 /// All forms: every codec that an encoder can be told to use, what it chooses by itself, and floats that never were packed.
 /// Blocks also as textures, in the form that the device takes them best, and one codec decoded at upload.
-pub(crate) fn forms(textures: arrays::Bricks) -> Vec<Form> {
+pub(crate) fn forms(textures: Bricks) -> Vec<Form> {
     let nothing = Options { max_error: None, psnr: None, ..Options::default() };
     let of = |name: &str, codec, bricks| Form {
         name: name.to_owned(),
         options: Some(Options { codec: Some(codec), ..nothing.clone() }),
         bricks,
     };
-    let mut forms = vec![Form { name: "channel".to_owned(), options: None, bricks: arrays::Bricks::AsStored }];
-    forms.push(of("f32", Codec::F32, arrays::Bricks::AsStored));
-    forms.push(of("f16", Codec::F16, arrays::Bricks::AsStored));
+    let mut forms = vec![Form { name: "channel".to_owned(), options: None, bricks: Bricks::AsStored }];
+    forms.push(of("f32", Codec::F32, Bricks::AsStored));
+    forms.push(of("f16", Codec::F16, Bricks::AsStored));
     for bits in 1..=8 {
-        forms.push(of(&format!("u{bits}"), Codec::Uniform { bits }, arrays::Bricks::AsStored));
+        forms.push(of(&format!("u{bits}"), Codec::Uniform { bits }, Bricks::AsStored));
     }
     for bits in 1..=8 {
-        forms.push(of(&format!("s{bits}"), Codec::Split { bits }, arrays::Bricks::AsStored));
+        forms.push(of(&format!("s{bits}"), Codec::Split { bits }, Bricks::AsStored));
     }
     for bits in 0..=8 {
-        forms.push(of(&format!("g{bits}"), Codec::Gradient { bits }, arrays::Bricks::AsStored));
+        forms.push(of(&format!("g{bits}"), Codec::Gradient { bits }, Bricks::AsStored));
     }
     for bits in 0..=5 {
-        forms.push(of(&format!("l{bits}"), Codec::Lattice { bits }, arrays::Bricks::AsStored));
+        forms.push(of(&format!("l{bits}"), Codec::Lattice { bits }, Bricks::AsStored));
     }
     for (format, name) in [(BlockFormat::Bc4, "bc4"), (BlockFormat::Bc3, "bc3"), (BlockFormat::Bc7, "bc7")] {
         for (axis, letter) in [(PackingAxis::X, 'x'), (PackingAxis::Y, 'y'), (PackingAxis::Z, 'z')] {
             let codec = Codec::Block { format, axis };
-            forms.push(of(&format!("{name}{letter}"), codec, arrays::Bricks::AsStored));
+            forms.push(of(&format!("{name}{letter}"), codec, Bricks::AsStored));
             forms.push(of(&format!("{name}{letter} texture"), codec, textures));
         }
     }
-    forms.push(of("u4 decoded", Codec::Uniform { bits: 4 }, arrays::Bricks::Decoded));
+    forms.push(of("u4 decoded", Codec::Uniform { bits: 4 }, Bricks::Decoded));
     let mut mixture = |name: &str, options| {
-        forms.push(Form { name: name.to_owned(), options: Some(options), bricks: arrays::Bricks::AsStored });
+        forms.push(Form { name: name.to_owned(), options: Some(options), bricks: Bricks::AsStored });
     };
     mixture("45 dB", Options::default());
     mixture("35 dB with shapes", Options { psnr: Some(35.0), shapes: 16, ..Options::default() });
@@ -125,8 +117,6 @@ pub(crate) struct Tally {
     pub failed: Vec<String>,
     pub left_out: Vec<String>,
     pub is_of_hits: bool,
-    /// Pixels that rounding decides.
-    pub ties: u64,
     /// What the device and the CPU took.
     pub seconds: [f64; 2],
 }
@@ -141,12 +131,6 @@ pub(crate) struct Matrix {
 /// picture is small. All pictures of a form together are held to what the renderer promises.
 const MOST_BAD: usize = 4;
 const MOST_MEAN: f64 = 5e-4;
-/// So many of a picture may be decided by rounding: rays that lie in planes of voxels are few.
-const MOST_TIES: usize = 32;
-/// How far aside rays are moved to tell, in parts of how far they go: some units of single precision, which both sides round to
-/// several times. And how many are.
-const NUDGE: f64 = 3e-7;
-const NUDGES: u32 = 32;
 /// What colours may differ by.
 const TOLERANCE: f64 = 1.0 / 255.0;
 const PIXELS: usize = (SMALL[0] * SMALL[1]) as usize;
@@ -192,10 +176,6 @@ impl Matrix {
         self.note(form, pass, at, &errors, seen, TOLERANCE);
     }
 
-    fn fail(&mut self, form: &str, pass: &str, what: String) {
-        self.tally(form, pass).failed.push(what);
-    }
-
     fn left_out(&mut self, form: &str, pass: &str, at: &str, why: &str) {
         self.tally(form, pass).left_out.push(format!("{at}: {why}"));
     }
@@ -222,7 +202,7 @@ impl Matrix {
         let mine = || self.tallies.iter().filter(|((form, _), _)| of_form.is_empty() || form == of_form);
         for ((form, pass), t) in mine() {
             println!(
-                "{form:18} {pass:24} {:4} pictures, {:9} pixels, {:8} seen, {:8.4} % good, mean {:.1e}, worst {:.1e} ({}), {} ties, {:.1} s and {:.1} s",
+                "{form:18} {pass:24} {:4} pictures, {:9} pixels, {:8} seen, {:8.4} % good, mean {:.1e}, worst {:.1e} ({}), {:.1} s and {:.1} s",
                 t.pictures,
                 t.pixels,
                 t.seen,
@@ -230,7 +210,6 @@ impl Matrix {
                 t.sum / t.pixels as f64,
                 t.worst,
                 t.worst_at,
-                t.ties,
                 t.seconds[0],
                 t.seconds[1]
             );
@@ -281,6 +260,8 @@ pub(crate) struct Pair {
     subject: String,
     form: String,
     channel: Channel,
+    /// What is added to the channel's indices for those of the grid.
+    index_offset: IVec3,
     volume: GpuVolume,
     /// The level of its surface, if it is to be shown as one.
     level: Option<f32>,
@@ -303,6 +284,14 @@ impl Pair {
     }
 }
 
+impl Shown<'_> {
+    /// Holds paths through the volume to those of the CPU.
+    pub(crate) fn compare_paths(&self, gpu: &Gpu) {
+        let name = format!("{}, {}", self.pair.form, self.pair.subject);
+        compare_on(&name, gpu, &self.pair.volume, &self.scene, PathSettings::default());
+    }
+}
+
 /// A volume in a form; as a surface too, if it is a level set.
 pub(crate) fn pairs(gpu: &Gpu, subject: &Subject, form: &Form) -> Vec<Pair> {
     let fog = pair(gpu, subject, form, false);
@@ -317,24 +306,20 @@ fn pair(gpu: &Gpu, subject: &Subject, form: &Form, is_surface: bool) -> Option<P
     };
     let level = is_surface.then(|| import_surface(subject.grid.clone()).expect("a linear transform").1);
     let report = import(subject.grid.clone()).expect("a linear transform").1;
-    let made = |channel, arrays: &Arrays| {
+    let made = |channel, index_offset, arrays: &Arrays| {
         let volume = GpuVolume::new(gpu, arrays).expect("a volume");
-        Pair { subject: subject.name.clone(), form: form.name.clone(), channel, volume, level }
+        Pair { subject: subject.name.clone(), form: form.name.clone(), channel, index_offset, volume, level }
     };
     let Some(options) = &form.options else {
         let channel = channel_of(subject.grid.clone());
         let arrays = Arrays::of_channels(&[&channel]).expect("arrays");
-        return Some(made(channel, &arrays));
+        return Some(made(channel, IVec3::ZERO, &arrays));
     };
     let mut grid = subject.grid.clone();
     let band = report.level_set_band;
     grid.name = "shown".to_owned();
-    let asset = pack(&[vec![grid]], options);
+    let asset = packed(&[vec![grid]], options);
     let channel = unpacked_as(&asset, 0, "shown", channel_of)?;
-    let channel = match report.negative_values {
-        0 => channel,
-        _ => with_nodes_of(&asset, &channel),
-    };
     let meaning = match (band, is_surface) {
         (None, _) => Meaning::Density,
         (Some(band), false) => Meaning::Fog { band },
@@ -346,59 +331,8 @@ fn pair(gpu: &Gpu, subject: &Subject, form: &Form, is_surface: bool) -> Option<P
         Err(GpuError::Unsupported { feature }) if feature.contains("not empty") => return None,
         arrays => arrays.expect("arrays"),
     };
-    Some(made(channel, &arrays))
-}
-
-/// A channel in a tree with the nodes of that of the first grid of a packed volume. Where all that stands below a node is less than 0,
-/// and counts as 0, the packed tree has it and that of a channel has not; steps begin where bricks do, so that pictures by steps
-/// are only the same where trees are.
-fn with_nodes_of(asset: &Asset, channel: &Channel) -> Channel {
-    let (trees, grid) = (asset.trees(), &asset.contents().frames[0].grids[0]);
-    let mut accessor = Accessor::new(&channel.tree);
-    let mut builder = TreeBuilder::new();
-    let mut values = Vec::new();
-    let mut take = |stored: IVec3| {
-        let brick = stored + (IVec3::from_array(grid.index_offset) >> 3);
-        let region = accessor.region(brick);
-        let taken = match (region.content, region.log2_bricks) {
-            (Content::Brick(index), _) => {
-                let of_brick: Vec<f32> =
-                    (0..BRICK_VOXELS).map(|offset| channel.tree.bricks.value(index, offset)).collect();
-                let summary = BrickSummary::of(of_brick.as_slice().try_into().expect("the voxels of a brick"));
-                values.extend(of_brick);
-                builder.brick(brick, summary).map(drop)
-            }
-            (Content::Constant(value), LOG2_NODE4_BRICKS) if value != 0.0 => {
-                // Once for each of its bricks, of which the first puts it there.
-                let _ = builder.tile(brick, TileSize::Node4, value);
-                Ok(())
-            }
-            (Content::Constant(value), _) => builder.tile(brick, TileSize::Brick, value),
-        };
-        taken.expect("a free place");
-    };
-    for cell in trees.cells_of(grid.levels[0]) {
-        let node5 = match cell.entry.content() {
-            Some(packed::Content::Node(node5)) => &trees.node5s[node5 as usize],
-            Some(packed::Content::Constant(value)) if value <= 0.0 => continue,
-            other => panic!("{other:?} of 4096³ voxels"),
-        };
-        for (slot, at) in mask::slots(trees, node5.mask, NODE5_SLOTS).zip(node5.first_entry as usize..) {
-            let first = node5_slot_brick(IVec3::from_array(cell.cell) << LOG2_NODE5_BRICKS, slot);
-            match trees.entries[at].content() {
-                Some(packed::Content::Node(node4)) => {
-                    mask::slots(trees, trees.node4s[node4 as usize].mask, NODE4_SLOTS)
-                        .for_each(|slot| take(node4_slot_brick(first, slot)));
-                }
-                Some(packed::Content::Constant(value)) if value > 0.0 => {
-                    (0..NODE4_SLOTS).for_each(|slot| take(node4_slot_brick(first, slot)));
-                }
-                _ => {}
-            }
-        }
-    }
-    let tree = builder.finish(Bricks::F32(values)).expect("a tree like another");
-    Channel { tree, ..channel.clone() }
+    let (channel, index_offset) = in_packed_tree(&asset, &channel, meaning).unwrap_or((channel, IVec3::ZERO));
+    Some(made(channel, index_offset, &arrays))
 }
 
 /// A volume in the light of a sun and an even sky, seen whole.
@@ -420,7 +354,7 @@ fn scene_of(channel: &Channel) -> Option<Scene<'_>> {
 /// Holds what a part shows of a volume to what the CPU does.
 pub(crate) fn hold(matrix: &mut Matrix, renderer: &mut Renderer, shown: &Shown<'_>, part: Part) {
     let Shown { pair, scene, look, field } = shown;
-    let Pair { subject: at, form, channel, volume, level } = pair;
+    let Pair { subject: at, form, channel, index_offset, volume, level } = pair;
     let is_of_surface = matches!(part, Part::Surface | Part::SurfaceHits);
     if is_of_surface != level.is_some() {
         return;
@@ -430,7 +364,15 @@ pub(crate) fn hold(matrix: &mut Matrix, renderer: &mut Renderer, shown: &Shown<'
     let level = level.unwrap_or(0.0);
     let few =
         Quality { step_voxels: 1.5, shadow_step_voxels: 4.0, sun_rays: 6, sky_rays: 2, ..Quality::default() };
-    let exact = Quality { shadow_step_voxels: 0.0, sun_rays: 3, sky_rays: 0, ..few };
+    let quality_by = |lookup: Lookup| match lookup {
+        // A step through a whole layer of voxels has its middle on the border of two, where rounding decides which is nearest:
+        // no step is so long.
+        Lookup::Nearest => {
+            Quality { step_voxels: 0.7, shadow_step_voxels: 0.9, shadow_growth: 0.0, lookup, ..few }
+        }
+        lookup => Quality { lookup, ..few },
+    };
+    let without_steps = Quality { shadow_step_voxels: 0.0, sun_rays: 3, sky_rays: 0, ..few };
     let pass = match part {
         Part::Density => Pass::View(View::Density { extinction }),
         Part::Depth => Pass::View(View::Depth),
@@ -440,9 +382,9 @@ pub(crate) fn hold(matrix: &mut Matrix, renderer: &mut Renderer, shown: &Shown<'
         Part::Steps(filter) => Pass::Opacity { filter, step_voxels: 0.5 },
         Part::Surface => Pass::View(View::Surface { level }),
         Part::SurfaceHits => Pass::SurfaceHits { level },
-        Part::March(lookup) if lookup.mean() == lookup => Pass::March(Quality { lookup, ..few }),
+        Part::March(lookup) if lookup.mean() == lookup => Pass::March(quality_by(lookup)),
         Part::March(lookup) => Pass::March(Quality { lookup, samples: 4, ..few }),
-        Part::Exact(lookup) => Pass::March(Quality { lookup, ..exact }),
+        Part::Exact(lookup) => Pass::March(Quality { lookup, ..without_steps }),
     };
     let start = Instant::now();
     renderer.prepare(volume, look, &pass, 0, None).expect("a pass");
@@ -455,7 +397,10 @@ pub(crate) fn hold(matrix: &mut Matrix, renderer: &mut Renderer, shown: &Shown<'
         Err(error) => panic!("{error}"),
     };
     let on_device = start.elapsed();
-    let rays = (0..PIXELS as u32).map(|i| ray_of(&scene.camera, i));
+    let rays = (0..PIXELS as u32).map(|i| {
+        let pixel = DVec2::new(f64::from(i % SMALL[0]), f64::from(i / SMALL[0])) + 0.5;
+        scene.camera.ray(pixel, SMALL[0], SMALL[1])
+    });
     let mut reader = field.reader();
     let count = |pixels: &[[f32; 4]]| pixels.iter().filter(|pixel| pixel[3] > 0.0).count();
     match pass {
@@ -478,7 +423,9 @@ pub(crate) fn hold(matrix: &mut Matrix, renderer: &mut Renderer, shown: &Shown<'
             matrix.colours(form, &name, at, &ours, &theirs);
         }
         Pass::Hits { above } => {
-            let expected: Vec<_> = rays.map(|ray| first_voxel(field, &mut reader, &ray, above)).collect();
+            let in_grid = |hit: VoxelHit| VoxelHit { voxel: hit.voxel + *index_offset, ..hit };
+            let expected: Vec<_> =
+                rays.map(|ray| first_voxel(field, &mut reader, &ray, above).map(in_grid)).collect();
             let errors: Vec<f64> = ours
                 .iter()
                 .zip(&expected)
@@ -502,15 +449,7 @@ pub(crate) fn hold(matrix: &mut Matrix, renderer: &mut Renderer, shown: &Shown<'
             let picture = nuage_render::picture::render(scene, quality, SMALL[0], SMALL[1], &|_, _| ());
             let theirs = picture.expect("a picture").pixels;
             match quality.samples {
-                1 => {
-                    let mut errors = differences(&ours, &theirs);
-                    let ties = settle_ties(&mut errors, shown, quality, &ours, &theirs);
-                    matrix.tally(form, &name).ties += ties as u64;
-                    if ties > MOST_TIES {
-                        matrix.fail(form, &name, format!("{at}: {ties} pixels that rounding decides"));
-                    }
-                    matrix.note(form, &name, at, &errors, count(&theirs), TOLERANCE);
-                }
+                1 => matrix.colours(form, &name, at, &ours, &theirs),
                 _ => matrix.deviation(form, &name, at, standard_errors(&ours, &theirs), count(&theirs)),
             }
         }
@@ -519,53 +458,6 @@ pub(crate) fn hold(matrix: &mut Matrix, renderer: &mut Renderer, shown: &Shown<'
     let tally = matrix.tally(form, &name);
     tally.seconds[0] += on_device.as_secs_f64();
     tally.seconds[1] += (start.elapsed() - on_device).as_secs_f64();
-}
-
-/// The ray through the middle of a pixel.
-fn ray_of(camera: &Camera, i: u32) -> Ray {
-    let pixel = DVec2::new(f64::from(i % SMALL[0]), f64::from(i / SMALL[0])) + 0.5;
-    camera.ray(pixel, SMALL[0], SMALL[1])
-}
-
-/// Where samples lie on a border of nearest voxels, rounding decides on which side, and both pictures are right: the middle of a
-/// step through a layer of one voxel is one. Pixels that are off are therefore marched once more on the CPU, by rays that are
-/// moved aside by no more than single precision rounds their positions. What lies between the answers is as right as they are.
-/// Gives how many pixels were settled so.
-fn settle_ties(
-    errors: &mut [f64],
-    Shown { scene, field, .. }: &Shown<'_>,
-    quality: Quality,
-    ours: &[[f32; 4]],
-    theirs: &[[f32; 4]],
-) -> usize {
-    let marcher = Marcher::new(scene, quality);
-    let mut worker = marcher.worker();
-    let mut ties = 0;
-    for (i, error) in errors.iter_mut().enumerate().filter(|(_, error)| **error > TOLERANCE) {
-        let (mut low, mut high) = (theirs[i], theirs[i]);
-        let ray = ray_of(&scene.camera, i as u32);
-        let Some([_, far]) = field.interval(&ray) else { continue };
-        for number in 0..NUDGES {
-            let aside = |axis: u32| f64::from(unit_f32(hash_u32(3 * number + axis)) - 0.5);
-            let nudge = DVec3::new(aside(0), aside(1), aside(2)) * (2.0 * NUDGE * far);
-            let nudged = Ray { origin: ray.origin + nudge, ..ray };
-            let random = hash_pixel(i as u32 % SMALL[0], i as u32 / SMALL[0], 0, 2);
-            let light = marcher.radiance(&mut worker, &nudged, random);
-            let [red, green, blue] = light.scattered.to_array();
-            for (channel, value) in [red, green, blue, 1.0 - light.transmittance].into_iter().enumerate() {
-                low[channel] = low[channel].min(value);
-                high[channel] = high[channel].max(value);
-            }
-        }
-        let outside = |channel: usize| {
-            let value = ours[i][channel];
-            let beyond = (low[channel] - value).max(value - high[channel]).max(0.0);
-            f64::from(beyond / theirs[i][channel].abs().max(1.0))
-        };
-        *error = (0..4).map(outside).fold(0.0, f64::max);
-        ties += usize::from(*error <= TOLERANCE);
-    }
-    ties
 }
 
 /// By how many standard errors the means of two pictures differ at most. Which voxel is chosen hangs on the last bits of distances,

@@ -5,6 +5,7 @@
 mod cells;
 #[path = "../common/mod.rs"]
 mod common;
+mod reference;
 
 use std::time::Instant;
 
@@ -170,7 +171,7 @@ impl Bench {
 
 /// All forms of the volumes that differ, by all filters: those that share a decoder with another of each third volume in turn,
 /// and large volumes and those that are like others in a form each, in turn. Prints what it found. `NUAGE_FORMS` names the forms
-/// that are wanted, with commas between them.
+/// that are wanted, with commas between them, and `NUAGE_VOLUMES` the files.
 #[test]
 #[ignore = "takes minutes for each form on a device in software"]
 fn the_whole_matrix_is_that_of_the_cpu() {
@@ -179,8 +180,12 @@ fn the_whole_matrix_is_that_of_the_cpu() {
     let wanted = |variable: &str, name: &str| {
         std::env::var(variable).map_or(true, |names| names.split(',').any(|wanted| wanted == name))
     };
-    let is_wanted = |file: &&&str| wanted("NUAGE_VOLUMES", file.rsplit(['/']).next().unwrap_or(file).trim_end_matches(".vdb"));
-    let load = |files: &[&str]| -> Vec<Subject> { files.iter().filter(is_wanted).flat_map(|file| subjects(file)).collect() };
+    let is_wanted = |file: &&&str| {
+        wanted("NUAGE_VOLUMES", file.rsplit(['/']).next().unwrap_or(file).trim_end_matches(".vdb"))
+    };
+    let load = |files: &[&str]| -> Vec<Subject> {
+        files.iter().filter(is_wanted).flat_map(|file| subjects(file)).collect()
+    };
     let whole = load(&[&SMALL_FILES[..], &WIDE_FILES[..]].concat());
     let in_turn = load(&[&LIKE_FILES[..], &LARGE_FILES[..]].concat());
     let unlike = bench.named(&UNLIKE_FORMS);
@@ -212,8 +217,20 @@ fn a_turn_through_the_matrix_is_that_of_the_cpu() {
     let Some(mut bench) = Bench::new() else { return };
     let files = SMALL_FILES.iter().chain(&WIDE_FILES);
     let all: Vec<Subject> = files.flat_map(|file| subjects(file)).collect();
-    // Textures and the other widths of codes have tests of their own.
-    for form in bench.named(&["channel", "f32", "u5", "s3", "g4", "l2", "bc4z", "bc3y", "bc7x", "45 dB"]) {
+    // The other widths of codes have tests of their own.
+    for form in bench.named(&[
+        "channel",
+        "f32",
+        "u5",
+        "s3",
+        "g4",
+        "l2",
+        "bc4z",
+        "bc3y",
+        "bc7x",
+        "bc7y texture",
+        "45 dB",
+    ]) {
         bench.hold(form, &[&all[0]], &[Part::Density]);
     }
     let few = bench.named(&["f16", "u4"]);
@@ -223,6 +240,28 @@ fn a_turn_through_the_matrix_is_that_of_the_cpu() {
     }
     let chosen: Vec<&Subject> = all.iter().step_by(4).collect();
     bench.hold(few[0], &chosen, &[Part::Steps(Filter::Nearest), Part::March(Lookup::Trilinear)]);
+    let rest = [
+        Part::March(Lookup::Tricubic),
+        Part::March(Lookup::StochasticTrilinear),
+        Part::March(Lookup::StochasticTricubic),
+        Part::Exact(Lookup::Trilinear),
+    ];
+    bench.hold(bench.named(&["channel"])[0], &[&all[0]], &rest);
     bench.matrix.print("");
     bench.matrix.check();
+}
+
+/// Paths look values up by functions of their own, at distances that chance decides.
+#[test]
+#[ignore = "takes a minute on a device in software"]
+fn paths_through_packed_bricks_are_those_of_the_cpu() {
+    let Some(bench) = Bench::new() else { return };
+    let subjects = [subjects(SMALL_FILES[0]), subjects("data/edge/v12_sphere_half.vdb")].concat();
+    for form in bench.named(&["u8", "u4", "bc4z", "bc7y texture", "45 dB"]) {
+        for subject in [&subjects[0], &subjects[subjects.len() - 1]] {
+            let pairs = pairs(&bench.gpu, subject, &bench.forms[form]);
+            let shown = pairs.first().and_then(Pair::shown);
+            shown.expect("something to be seen").compare_paths(&bench.gpu);
+        }
+    }
 }

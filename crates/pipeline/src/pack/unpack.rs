@@ -161,7 +161,8 @@ fn active_mask<V: PartialEq>(
     let is_whole = is_inside(origin, TILE_SIDES[2], active_box);
     // A word of the mask is a layer of voxels of the same x, a byte of it a row of the same y.
     let inside = |x: i32| {
-        let is_in = |i: i32| is_inside([origin[0] + x, origin[1] + (i >> 3), origin[2] + (i & 7)], 1, active_box);
+        let is_in =
+            |i: i32| is_inside([origin[0] + x, origin[1] + (i >> 3), origin[2] + (i & 7)], 1, active_box);
         (0..64).filter(|i| is_whole || is_in(*i)).fold(0, |word, i| word | 1_u64 << i)
     };
     values.chunks(64).zip(0..).map(|(values, x)| word(values) & inside(x)).collect()
