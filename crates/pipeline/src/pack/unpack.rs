@@ -5,7 +5,7 @@
 use std::sync::Arc;
 
 use glam::IVec3;
-use nuage_vdb::{AnyTree, Grid, Metadata, Shape, Tree, TreeBuilder};
+use nuage_vdb::{AnyTree, Grid, Metadata, Shape, Tree, TreeBuilder, Value};
 use nuage_volume::codec::DecodeError;
 use nuage_volume::format::{Asset, FrameGrid};
 use nuage_volume::packed::{Content, Entry, TreeRef, mask};
@@ -140,7 +140,7 @@ fn zip(trees: &[Tree<f32>; 3], active_box: ActiveBox) -> Result<Tree<[f32; 3]>, 
         // Where another number has something finer, its leaves and tiles cover what differs from the background.
         let is_tile = |tree: &Tree<f32>| tree.voxel(origin).depth <= depth as i32;
         if trees.iter().all(is_tile) {
-            builder.tile(depth, origin, at(origin), is_inside(origin, TILE_SIDES[depth], active_box));
+            put_tile(&mut builder, depth, origin, at(origin), background, active_box);
         }
     }
     Ok(builder.build()?)
@@ -170,6 +170,26 @@ fn active_mask<V: PartialEq>(
 
 /// The voxels along a side of tiles, and of bricks, by how many levels stand above them.
 const TILE_SIDES: [i32; 3] = [4096, 128, 8];
+
+/// Adds a tile, which is active if all of it may be. A brick of one value of which only a part is active is a leaf.
+fn put_tile<V: Value<Stored = V>>(
+    builder: &mut TreeBuilder<V>,
+    depth: usize,
+    origin: [i32; 3],
+    value: V,
+    background: V,
+    active_box: ActiveBox,
+) {
+    let is_active = is_inside(origin, TILE_SIDES[depth], active_box);
+    if depth == 2 && !is_active {
+        let values = [value; BRICK_VOXELS];
+        let active = active_mask(&values, background, origin, active_box);
+        if active.iter().any(|word| *word != 0) {
+            return builder.leaf(origin, &active, &values);
+        }
+    }
+    builder.tile(depth, origin, value, is_active);
+}
 
 /// Whether all voxels of a cube lie inside of a box.
 fn is_inside(origin: [i32; 3], side: i32, active_box: ActiveBox) -> bool {
@@ -218,8 +238,7 @@ impl Walk<'_> {
     fn tile(&mut self, depth: usize, brick: IVec3, value: f32) {
         if value != self.background {
             let origin = self.origin(brick);
-            let is_active = is_inside(origin, TILE_SIDES[depth], self.active_box);
-            self.builder.tile(depth, origin, value, is_active);
+            put_tile(&mut self.builder, depth, origin, value, self.background, self.active_box);
         }
     }
 
