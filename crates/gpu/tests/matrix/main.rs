@@ -56,51 +56,6 @@ const WIDE_FILES: [&str; 9] = [
     "data/edge/tiles_levels_bg_m1_none.vdb",
 ];
 
-/// The same volumes as others in other files, and those of sequences.
-const LIKE_FILES: [&str; 41] = [
-    "data/public/openusd_smoke_000001.vdb",
-    "data/public/openusd_smoke_000003.vdb",
-    "data/sequences/chimney/fluid_data_0001.vdb",
-    "data/sequences/chimney/fluid_data_0050.vdb",
-    "data/sequences/chimney/fluid_data_0100.vdb",
-    "data/sequences/chimney_full/fluid_data_0001.vdb",
-    "data/sequences/chimney_full/fluid_data_0051.vdb",
-    "data/sequences/chimney_full/fluid_data_0100.vdb",
-    "data/sequences/explosion/fluid_data_0001.vdb",
-    "data/sequences/explosion/fluid_data_0025.vdb",
-    "data/sequences/explosion/fluid_data_0050.vdb",
-    "data/sequences/blender_variants/test40_f6_NONE_FULL.vdb",
-    "data/sequences/blender_variants/test40_f6_NONE_HALF.vdb",
-    "data/sequences/blender_variants/test40_f6_ZIP_FULL.vdb",
-    "data/sequences/blender_variants/test40_f6_ZIP_HALF.vdb",
-    "data/sequences/blender_variants/test40_f6_BLOSC_FULL.vdb",
-    "data/sequences/blender_variants/test40_f6_BLOSC_HALF.vdb",
-    "data/edge/background_nonzero_none.vdb",
-    "data/edge/comp_random_blosc.vdb",
-    "data/edge/comp_random_mask.vdb",
-    "data/edge/comp_random_none.vdb",
-    "data/edge/comp_random_zipmask.vdb",
-    "data/edge/comp_seven_blosc.vdb",
-    "data/edge/comp_seven_bloscmask.vdb",
-    "data/edge/comp_seven_mask.vdb",
-    "data/edge/comp_seven_none.vdb",
-    "data/edge/comp_sphere_blosc.vdb",
-    "data/edge/comp_sphere_bloscmask.vdb",
-    "data/edge/comp_sphere_mask.vdb",
-    "data/edge/comp_sphere_none.vdb",
-    "data/edge/comp_sphere_zipmask.vdb",
-    "data/edge/half_blosc.vdb",
-    "data/edge/half_bloscmask.vdb",
-    "data/edge/half_mask.vdb",
-    "data/edge/half_none.vdb",
-    "data/edge/leaf_masks_zip.vdb",
-    "data/edge/single_voxel_0.vdb",
-    "data/edge/special_values_none.vdb",
-    "data/edge/transforms_none.vdb",
-    "data/edge/types_bloscmask.vdb",
-    "data/edge/tiles_levels_none.vdb",
-];
-
 /// Volumes that take seconds to be packed, the largest last.
 const LARGE_FILES: [&str; 8] = [
     "data/public/gaffer_smoke.vdb",
@@ -137,6 +92,29 @@ const UNLIKE_FORMS: [&str; 20] = [
     "error of 2 %",
 ];
 
+/// All files of the corpus that are in no list, by their paths below the data: other frames of sequences, and the same volumes as
+/// others, written otherwise. Damaged ones are left out.
+fn other_files() -> Vec<String> {
+    let Some(data) = nuage_testkit::find("data") else { return Vec::new() };
+    let listed = [&SMALL_FILES[..], &WIDE_FILES[..], &LARGE_FILES[..]].concat();
+    let (mut folders, mut files) = (vec![data.clone()], Vec::new());
+    while let Some(folder) = folders.pop() {
+        for entry in std::fs::read_dir(folder).expect("a folder") {
+            let path = entry.expect("a file or folder").path();
+            let relative = format!("data/{}", path.strip_prefix(&data).expect("below the data").display());
+            if path.is_dir() && !path.ends_with("bad") {
+                folders.push(path);
+            } else if path.extension().is_some_and(|kind| kind == "vdb")
+                && !listed.contains(&relative.as_str())
+            {
+                files.push(relative);
+            }
+        }
+    }
+    files.sort();
+    files
+}
+
 struct Bench {
     gpu: Gpu,
     renderer: Renderer,
@@ -170,7 +148,7 @@ impl Bench {
 }
 
 /// All forms of the volumes that differ, by all filters: those that share a decoder with another of each third volume in turn,
-/// and large volumes and those that are like others in a form each, in turn. Prints what it found. `NUAGE_FORMS` names the forms
+/// and large volumes and all that are like others in a form each, in turn. Prints what it found. `NUAGE_FORMS` names the forms
 /// that are wanted, with commas between them, and `NUAGE_VOLUMES` the files.
 #[test]
 #[ignore = "takes minutes for each form on a device in software"]
@@ -180,14 +158,16 @@ fn the_whole_matrix_is_that_of_the_cpu() {
     let wanted = |variable: &str, name: &str| {
         std::env::var(variable).map_or(true, |names| names.split(',').any(|wanted| wanted == name))
     };
-    let is_wanted = |file: &&&str| {
-        wanted("NUAGE_VOLUMES", file.rsplit(['/']).next().unwrap_or(file).trim_end_matches(".vdb"))
+    let is_wanted = |file: &&str| {
+        wanted("NUAGE_VOLUMES", file.rsplit('/').next().unwrap_or(file).trim_end_matches(".vdb"))
     };
     let load = |files: &[&str]| -> Vec<Subject> {
-        files.iter().filter(is_wanted).flat_map(|file| subjects(file)).collect()
+        files.iter().copied().filter(is_wanted).flat_map(subjects).collect()
     };
+    let others = other_files();
+    let others: Vec<&str> = others.iter().map(String::as_str).collect();
     let whole = load(&[&SMALL_FILES[..], &WIDE_FILES[..]].concat());
-    let in_turn = load(&[&LIKE_FILES[..], &LARGE_FILES[..]].concat());
+    let in_turn = [&others[..], &LARGE_FILES[..]].concat();
     let unlike = bench.named(&UNLIKE_FORMS);
     for form in 0..bench.forms.len() {
         if !wanted("NUAGE_FORMS", &bench.forms[form].name) {
@@ -195,9 +175,9 @@ fn the_whole_matrix_is_that_of_the_cpu() {
         }
         let step = if unlike.contains(&form) { 1 } else { 3 };
         let own = whole.iter().skip(form % step).step_by(step);
-        let others = in_turn.iter().skip(form).step_by(bench.forms.len());
-        let wrapped = in_turn.iter().enumerate().filter(|(i, _)| unlike.get(i % unlike.len()) == Some(&form));
-        let chosen: Vec<&Subject> = own.chain(others).chain(wrapped.map(|(_, subject)| subject)).collect();
+        let others: Vec<&str> = in_turn.iter().skip(form).step_by(bench.forms.len()).copied().collect();
+        let others = load(&others);
+        let chosen: Vec<&Subject> = own.chain(&others).collect();
         bench.hold(form, &chosen, &ALL_PARTS);
         println!(
             "{}: {} volumes, {:.0} s",
