@@ -372,7 +372,6 @@ pub(crate) fn hold(matrix: &mut Matrix, renderer: &mut Renderer, shown: &Shown<'
         }
         lookup => Quality { lookup, ..few },
     };
-    let without_steps = Quality { shadow_step_voxels: 0.0, sun_rays: 3, sky_rays: 0, ..few };
     let pass = match part {
         Part::Density => Pass::View(View::Density { extinction }),
         Part::Depth => Pass::View(View::Depth),
@@ -384,7 +383,10 @@ pub(crate) fn hold(matrix: &mut Matrix, renderer: &mut Renderer, shown: &Shown<'
         Part::SurfaceHits => Pass::SurfaceHits { level },
         Part::March(lookup) if lookup.mean() == lookup => Pass::March(quality_by(lookup)),
         Part::March(lookup) => Pass::March(Quality { lookup, samples: 4, ..few }),
-        Part::Exact(lookup) => Pass::March(Quality { lookup, ..without_steps }),
+        Part::Exact(lookup) => {
+            let by = quality_by(lookup);
+            Pass::March(Quality { shadow_step_voxels: 0.0, sun_rays: 3, sky_rays: 0, ..by })
+        }
     };
     let start = Instant::now();
     renderer.prepare(volume, look, &pass, 0, None).expect("a pass");
