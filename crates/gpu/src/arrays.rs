@@ -199,7 +199,7 @@ impl Arrays {
                 cells: [tree.first_cell, tree.cell_count],
                 brick_unit: 1.0,
                 bounds_unit: unit,
-                floor: f32::MIN,
+                floor: 0.0,
                 meaning: Meaning::Density.line(),
             }));
             arrays.largest.push(bounds.max);
@@ -605,9 +605,10 @@ impl Arrays {
         HEADER_WORDS + self.trees.size_bytes() / size_of::<u32>()
     }
 
-    /// Whether all values mean themselves.
+    /// Whether all values mean themselves: none is less than 0, and has to be raised.
     pub(crate) fn are_densities(&self) -> bool {
-        self.places.iter().flatten().all(|place| place.meaning == Meaning::Density.line())
+        let is_density = |place: &Place| place.meaning == Meaning::Density.line() && place.floor >= 0.0;
+        self.places.iter().flatten().all(is_density)
     }
 
     /// Whether all fields have a map.

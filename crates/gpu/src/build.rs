@@ -430,7 +430,7 @@ fn place(grid: &Grid, channel: u64) -> Place {
         cells: [channel as u32, 0],
         brick_unit: 1.0,
         bounds_unit: 1.0,
-        floor: f32::MIN,
+        floor: 0.0,
         // What is in the tree is a density already.
         meaning: Meaning::Density.line(),
     }

@@ -547,6 +547,25 @@ fn nan_and_infinities_are_taken_as_numbers() {
     }
 }
 
+/// Else what was never to be seen would be, since importing keeps to the box of what is active.
+#[test]
+fn values_beside_the_active_box_come_back_inactive() {
+    let mut builder = TreeBuilder::new(0.0, Shape::STANDARD);
+    let mut active = [0; 8];
+    active[1] = 0b1111 << 16;
+    builder.leaf([0; 3], &active, &[0.5; 512]);
+    builder.tile(2, [8, 0, 0], 0.25, false);
+    let tree = builder.build().unwrap();
+    let grids = vec![grid("odd", tree.clone()), grid("v", tree.map(|value| [value, 1.5 * value, 0.0]))];
+    let packed = check(&still(grids), &Options { codec: Some(Codec::F32), ..NOTHING });
+    for grid in packed.frame(0).0 {
+        assert_eq!(grid.tree.active_bbox(), Some([[1, 2, 0], [1, 2, 3]]), "{}", grid.name);
+        let numbers = numbers(&grid).0.remove(0);
+        assert_eq!(numbers.voxel([7, 7, 7]).value, 0.5);
+        assert_eq!(numbers.voxel([9, 1, 1]).value, 0.25);
+    }
+}
+
 #[test]
 fn small_values_beside_a_large_background_are_kept() {
     for background in [1.0, -1.0, 1e6] {

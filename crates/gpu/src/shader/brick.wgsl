@@ -4,8 +4,7 @@
 struct Values { unit: f32, smallest: f32, meaning: vec3<f32> }
 
 fn values_of(field: u32) -> Values {
-    let smallest = fields[field].bounds_max.w;
-    return Values(fields[field].origin.w, select(smallest, max(smallest, 0.0), ARE_DENSITIES), fields[field].value.xyz);
+    return Values(fields[field].origin.w, fields[field].bounds_max.w, fields[field].value.xyz);
 }
 
 struct Brick { tag: u32, at: u32, is_f32: bool, line: Line }

@@ -5,7 +5,6 @@
 #![allow(unreachable_pub, reason = "a module of test binaries, not of a library")]
 #![allow(clippy::print_stdout, reason = "the measured errors are worth reading")]
 
-pub mod matrix;
 pub mod paths;
 
 use std::convert::Infallible;
@@ -231,7 +230,7 @@ pub fn unpacked_as(
     let (grids, _) = unpack_frame(asset, frame).expect("a frame");
     let grid = grids.into_iter().find(|grid| grid.name == name)?;
     let mut channel = import(grid);
-    // BC4 has no exact zero beside what it blends: what spills beyond the source's box would move where rays begin to step.
+    // Shaders keep to the source's box. What decodes to 0 at its faces is in none that importing finds.
     let contents = asset.contents();
     let is_same = |grid: &&FrameGrid| contents.channels[grid.channel as usize].name == name;
     let [min, max] = contents.frames[frame].grids.iter().find(is_same).and_then(|grid| grid.active_box)?;

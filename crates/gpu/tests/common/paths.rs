@@ -72,7 +72,11 @@ fn of_cpu(scene: &Scene<'_>, settings: PathSettings, samples: u32) -> [Vec<Estim
 
 /// Holds a scene's picture of paths to that of the CPU.
 pub fn compare(name: &str, gpu: &Gpu, scene: &Scene<'_>, settings: PathSettings) {
-    let volume = &super::uploaded(gpu, &channels_of(scene));
+    compare_on(name, gpu, &super::uploaded(gpu, &channels_of(scene)), scene, settings);
+}
+
+/// The same for a volume that is on the device, in whatever form.
+pub fn compare_on(name: &str, gpu: &Gpu, volume: &GpuVolume, scene: &Scene<'_>, settings: PathSettings) {
     let look = Look::of_scene(scene).expect("a look");
     let ours = of_gpu(gpu, volume, &look, settings, 8);
     let theirs = of_cpu(scene, settings, 64);

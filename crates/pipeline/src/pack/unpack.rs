@@ -1,11 +1,11 @@
 //! From a packed frame back to grids, as the source held them but for what encoding lost.
 //!
-//! Voxels are active where they differ from the background.
+//! Voxels are active where they differ from the background, inside of the box in which the source's were.
 
 use std::sync::Arc;
 
 use glam::IVec3;
-use nuage_vdb::{AnyTree, Grid, Metadata, Shape, Tree, TreeBuilder};
+use nuage_vdb::{AnyTree, Grid, Metadata, Shape, Tree, TreeBuilder, Value};
 use nuage_volume::codec::DecodeError;
 use nuage_volume::format::{Asset, FrameGrid};
 use nuage_volume::packed::{Content, Entry, TreeRef, mask};
@@ -48,7 +48,7 @@ pub fn unpack_frame(asset: &Asset, frame: usize) -> Result<(Vec<Grid>, Metadata)
             grids[i..i + count].iter().map(|grid| float_tree(asset, grid)).collect::<Result<Vec<_>, _>>()?;
         let (header, metadata) = read_header(grid, channel(grid).map_or("", |channel| &channel.name))?;
         file_metadata = metadata;
-        unpacked.push(with_values(header, trees)?);
+        unpacked.push(with_values(header, trees, grid.active_box)?);
         i += count;
     }
     Ok((unpacked, file_metadata))
@@ -80,15 +80,15 @@ fn read_header(grid: &FrameGrid, name: &str) -> Result<(Grid, Metadata), UnpackE
 }
 
 /// A grid like the one given, with these numbers.
-fn with_values(grid: Grid, trees: Vec<Tree<f32>>) -> Result<Grid, UnpackError> {
+fn with_values(grid: Grid, trees: Vec<Tree<f32>>, active_box: ActiveBox) -> Result<Grid, UnpackError> {
     let tree: AnyTree = match (&*grid.tree, <[Tree<f32>; 3]>::try_from(trees)) {
         (AnyTree::Vec3d(like), Ok(trees)) => {
-            let (tree, exact) = (zip(&trees)?, like.background);
+            let (tree, exact) = (zip(&trees, active_box)?, like.background);
             let narrow = tree.background;
             let wide = |value: [f32; 3]| std::array::from_fn(|c| widened(value[c], narrow[c], exact[c]));
             tree.map(wide).into()
         }
-        (_, Ok(trees)) => zip(&trees)?.into(),
+        (_, Ok(trees)) => zip(&trees, active_box)?.into(),
         (like, Err(trees)) => {
             let tree = trees.into_iter().next().unwrap_or_else(|| Tree::empty(0.0, Shape::STANDARD));
             match like {
@@ -110,7 +110,7 @@ fn widened(value: f32, background: f32, exact: f64) -> f64 {
 }
 
 /// A tree of vectors from those of their numbers: leaves and tiles wherever one of them has some.
-fn zip(trees: &[Tree<f32>; 3]) -> Result<Tree<[f32; 3]>, UnpackError> {
+fn zip(trees: &[Tree<f32>; 3], active_box: ActiveBox) -> Result<Tree<[f32; 3]>, UnpackError> {
     let background = [0, 1, 2].map(|c| trees[c].background);
     let at = |origin: [i32; 3]| [0, 1, 2].map(|c| trees[c].voxel(origin).value);
     let mut builder = TreeBuilder::new(background, Shape::STANDARD);
@@ -122,7 +122,7 @@ fn zip(trees: &[Tree<f32>; 3]) -> Result<Tree<[f32; 3]>, UnpackError> {
         let values: Vec<[f32; 3]> = (0..BRICK_VOXELS as i32)
             .map(|i| at([origin[0] + (i >> 6), origin[1] + (i >> 3 & 7), origin[2] + (i & 7)]))
             .collect();
-        builder.leaf(*origin, &active_mask(&values, background), &values);
+        builder.leaf(*origin, &active_mask(&values, background, *origin, active_box), &values);
     }
     let mut tiles: Vec<(usize, [i32; 3])> = Vec::new();
     for tree in trees {
@@ -130,7 +130,7 @@ fn zip(trees: &[Tree<f32>; 3]) -> Result<Tree<[f32; 3]>, UnpackError> {
         for (depth, (branching, node)) in
             tree.inner_nodes().map(|(b, n)| (if b.log2_children == 5 { 1 } else { 2 }, (b, n)))
         {
-            let slots = node.tile_slots().filter(|(_, _, active)| *active);
+            let slots = node.tile_slots().filter(|(_, value, _)| *value != tree.background);
             tiles.extend(slots.map(|(slot, _, _)| (depth, branching.child_origin(node.origin, slot))));
         }
     }
@@ -140,17 +140,61 @@ fn zip(trees: &[Tree<f32>; 3]) -> Result<Tree<[f32; 3]>, UnpackError> {
         // Where another number has something finer, its leaves and tiles cover what differs from the background.
         let is_tile = |tree: &Tree<f32>| tree.voxel(origin).depth <= depth as i32;
         if trees.iter().all(is_tile) {
-            builder.tile(depth, origin, at(origin), true);
+            put_tile(&mut builder, depth, origin, at(origin), background, active_box);
         }
     }
     Ok(builder.build()?)
 }
 
-fn active_mask<V: PartialEq>(values: &[V], background: V) -> Vec<u64> {
+/// The first and the last active voxel of a source along each axis, if it had any.
+type ActiveBox = Option<[[i32; 3]; 2]>;
+
+fn active_mask<V: PartialEq>(
+    values: &[V],
+    background: V,
+    origin: [i32; 3],
+    active_box: ActiveBox,
+) -> Vec<u64> {
     let word = |values: &[V]| {
         values.iter().enumerate().fold(0, |word, (i, value)| word | u64::from(*value != background) << i)
     };
-    values.chunks(64).map(word).collect()
+    let is_whole = is_inside(origin, TILE_SIDES[2], active_box);
+    // A word of the mask is a layer of voxels of the same x, a byte of it a row of the same y.
+    let inside = |x: i32| {
+        let is_in =
+            |i: i32| is_inside([origin[0] + x, origin[1] + (i >> 3), origin[2] + (i & 7)], 1, active_box);
+        (0..64).filter(|i| is_whole || is_in(*i)).fold(0, |word, i| word | 1_u64 << i)
+    };
+    values.chunks(64).zip(0..).map(|(values, x)| word(values) & inside(x)).collect()
+}
+
+/// The voxels along a side of tiles, and of bricks, by how many levels stand above them.
+const TILE_SIDES: [i32; 3] = [4096, 128, 8];
+
+/// Adds a tile, which is active if all of it may be. A brick of one value of which only a part is active is a leaf.
+fn put_tile<V: Value<Stored = V>>(
+    builder: &mut TreeBuilder<V>,
+    depth: usize,
+    origin: [i32; 3],
+    value: V,
+    background: V,
+    active_box: ActiveBox,
+) {
+    let is_active = is_inside(origin, TILE_SIDES[depth], active_box);
+    if depth == 2 && !is_active {
+        let values = [value; BRICK_VOXELS];
+        let active = active_mask(&values, background, origin, active_box);
+        if active.iter().any(|word| *word != 0) {
+            return builder.leaf(origin, &active, &values);
+        }
+    }
+    builder.tile(depth, origin, value, is_active);
+}
+
+/// Whether all voxels of a cube lie inside of a box.
+fn is_inside(origin: [i32; 3], side: i32, active_box: ActiveBox) -> bool {
+    let Some([min, max]) = active_box else { return false };
+    (0..3).all(|axis| origin[axis] >= min[axis] && origin[axis] <= max[axis].saturating_sub(side - 1))
 }
 
 /// The numbers of a channel of a frame, in the finest level.
@@ -163,6 +207,7 @@ fn float_tree(asset: &Asset, grid: &FrameGrid) -> Result<Tree<f32>, UnpackError>
         asset,
         builder: TreeBuilder::new(tree.background, Shape::STANDARD),
         background: tree.background,
+        active_box: grid.active_box,
         offset: IVec3::from_array(grid.index_offset),
         unit,
         floor,
@@ -177,6 +222,7 @@ struct Walk<'a> {
     asset: &'a Asset,
     builder: TreeBuilder<f32>,
     background: f32,
+    active_box: ActiveBox,
     offset: IVec3,
     unit: f32,
     floor: f32,
@@ -191,7 +237,8 @@ impl Walk<'_> {
 
     fn tile(&mut self, depth: usize, brick: IVec3, value: f32) {
         if value != self.background {
-            self.builder.tile(depth, self.origin(brick), value, true);
+            let origin = self.origin(brick);
+            put_tile(&mut self.builder, depth, origin, value, self.background, self.active_box);
         }
     }
 
@@ -229,7 +276,9 @@ impl Walk<'_> {
                 Some(Content::Constant(value)) => self.tile(2, brick, value),
                 Some(Content::Brick { codec, offset }) => {
                     self.asset.store().decode(codec, offset, self.unit, self.floor, &mut values)?;
-                    self.builder.leaf(self.origin(brick), &active_mask(&values, self.background), &values);
+                    let origin = self.origin(brick);
+                    let active = active_mask(&values, self.background, origin, self.active_box);
+                    self.builder.leaf(origin, &active, &values);
                 }
                 _ => {}
             }

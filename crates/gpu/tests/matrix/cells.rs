@@ -1,8 +1,9 @@
 //! The matrix of volumes, forms of bricks and filters, each cell of which is a picture of the GPU held to that of the CPU.
 
 use std::collections::BTreeMap;
+use std::time::Instant;
 
-use glam::{DVec2, DVec3};
+use glam::{DVec2, DVec3, IVec3};
 use nuage_gpu::arrays::{Arrays, Bricks, Meaning, Wanted};
 use nuage_gpu::device::Gpu;
 use nuage_gpu::error::GpuError;
@@ -17,8 +18,9 @@ use nuage_render::filter::{Filter, Lookup};
 use nuage_render::framing::{WorldBox, fit_camera, fit_density_scale};
 use nuage_render::light::Sun;
 use nuage_render::march::Quality;
+use nuage_render::path::PathSettings;
 use nuage_render::scene::{Phase, Scene, Shape, Volume};
-use nuage_render::surface::{SurfaceHit, first_hit, first_voxel};
+use nuage_render::surface::{SurfaceHit, VoxelHit, first_hit, first_voxel};
 use nuage_render::traverse::Field;
 use nuage_render::views::{View, render_view};
 use nuage_vdb::Grid;
@@ -26,16 +28,19 @@ use nuage_volume::channel::Channel;
 use nuage_volume::codec::Codec;
 use nuage_volume::codec::block::{BlockFormat, PackingAxis};
 
-use super::{differences, is_same_hit, packed, unpacked_as};
+use crate::common::paths::compare_on;
+use crate::common::{differences, is_same_hit, packed, unpacked_as};
+use crate::reference::in_packed_tree;
 
 /// What is looked at, by name.
-pub struct Subject {
+#[derive(Clone)]
+pub(crate) struct Subject {
     pub name: String,
     pub grid: Grid,
 }
 
 /// A form in which a device has bricks.
-pub struct Form {
+pub(crate) struct Form {
     pub name: String,
     /// How they are packed; `None` for a channel that never was.
     pub options: Option<Options>,
@@ -44,7 +49,7 @@ pub struct Form {
 
 /// All forms: every codec that an encoder can be told to use, what it chooses by itself, and floats that never were packed.
 /// Blocks also as textures, in the form that the device takes them best, and one codec decoded at upload.
-pub fn forms(textures: Bricks) -> Vec<Form> {
+pub(crate) fn forms(textures: Bricks) -> Vec<Form> {
     let nothing = Options { max_error: None, psnr: None, ..Options::default() };
     let of = |name: &str, codec, bricks| Form {
         name: name.to_owned(),
@@ -84,7 +89,7 @@ pub fn forms(textures: Bricks) -> Vec<Form> {
 }
 
 /// The drawable grids of a file below the data.
-pub fn subjects(relative: &str) -> Vec<Subject> {
+pub(crate) fn subjects(relative: &str) -> Vec<Subject> {
     let Some(path) = nuage_testkit::find(relative) else { return Vec::new() };
     let file = nuage_vdb::File::open(std::fs::read(path).expect("readable")).expect("a VDB file");
     let name = relative.rsplit('/').next().unwrap_or(relative).trim_end_matches(".vdb");
@@ -101,7 +106,7 @@ pub fn subjects(relative: &str) -> Vec<Subject> {
 
 /// What a comparison found.
 #[derive(Default, Clone)]
-pub struct Tally {
+pub(crate) struct Tally {
     pub pictures: u32,
     pub pixels: u64,
     pub good: u64,
@@ -112,11 +117,13 @@ pub struct Tally {
     pub failed: Vec<String>,
     pub left_out: Vec<String>,
     pub is_of_hits: bool,
+    /// What the device and the CPU took.
+    pub seconds: [f64; 2],
 }
 
 /// Comparisons by form and by what is shown.
 #[derive(Default)]
-pub struct Matrix {
+pub(crate) struct Matrix {
     pub tallies: BTreeMap<(String, String), Tally>,
 }
 
@@ -124,9 +131,11 @@ pub struct Matrix {
 /// picture is small. All pictures of a form together are held to what the renderer promises.
 const MOST_BAD: usize = 4;
 const MOST_MEAN: f64 = 5e-4;
+/// What colours may differ by.
+const TOLERANCE: f64 = 1.0 / 255.0;
 const PIXELS: usize = (SMALL[0] * SMALL[1]) as usize;
 /// Pictures of the matrix are small.
-pub const SMALL: [u32; 2] = [48, 32];
+pub(crate) const SMALL: [u32; 2] = [48, 32];
 
 impl Matrix {
     fn tally(&mut self, form: &str, pass: &str) -> &mut Tally {
@@ -164,7 +173,7 @@ impl Matrix {
     fn colours(&mut self, form: &str, pass: &str, at: &str, ours: &[[f32; 4]], reference: &[[f32; 4]]) {
         let errors = differences(ours, reference);
         let seen = reference.iter().filter(|pixel| pixel[3] > 0.0).count();
-        self.note(form, pass, at, &errors, seen, 1.0 / 255.0);
+        self.note(form, pass, at, &errors, seen, TOLERANCE);
     }
 
     fn left_out(&mut self, form: &str, pass: &str, at: &str, why: &str) {
@@ -172,7 +181,7 @@ impl Matrix {
     }
 
     /// Holds all pictures of each form and pass, and of each pass in all forms.
-    pub fn check(&self) {
+    pub(crate) fn check(&self) {
         let mut failed: Vec<String> = Vec::new();
         for ((form, pass), tally) in &self.tallies {
             failed.extend(tally.failed.iter().map(|what| format!("{form}, {pass}, {what}")));
@@ -189,18 +198,20 @@ impl Matrix {
     }
 
     /// Prints a line for each pass of a form, or of all.
-    pub fn print(&self, of_form: &str) {
+    pub(crate) fn print(&self, of_form: &str) {
         let mine = || self.tallies.iter().filter(|((form, _), _)| of_form.is_empty() || form == of_form);
         for ((form, pass), t) in mine() {
             println!(
-                "{form:18} {pass:24} {:4} pictures, {:9} pixels, {:8} seen, {:8.4} % good, mean {:.1e}, worst {:.1e} ({})",
+                "{form:18} {pass:24} {:4} pictures, {:9} pixels, {:8} seen, {:8.4} % good, mean {:.1e}, worst {:.1e} ({}), {:.1} s and {:.1} s",
                 t.pictures,
                 t.pixels,
                 t.seen,
                 100.0 * t.good as f64 / t.pixels as f64,
                 t.sum / t.pixels as f64,
                 t.worst,
-                t.worst_at
+                t.worst_at,
+                t.seconds[0],
+                t.seconds[1]
             );
         }
         for ((form, pass), t) in mine() {
@@ -212,7 +223,7 @@ impl Matrix {
 
 /// What of a volume is shown.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Part {
+pub(crate) enum Part {
     Density,
     Depth,
     Index,
@@ -225,7 +236,7 @@ pub enum Part {
     Exact(Lookup),
 }
 
-pub const ALL_PARTS: [Part; 16] = [
+pub(crate) const ALL_PARTS: [Part; 16] = [
     Part::Density,
     Part::Depth,
     Part::Index,
@@ -245,19 +256,44 @@ pub const ALL_PARTS: [Part; 16] = [
 ];
 
 /// A volume on both sides, in a form.
-pub struct Pair {
+pub(crate) struct Pair {
     subject: String,
     form: String,
     channel: Channel,
+    /// What is added to the channel's indices for those of the grid.
+    index_offset: IVec3,
     volume: GpuVolume,
     /// The level of its surface, if it is to be shown as one.
     level: Option<f32>,
-    /// Whether it is packed with densities below 0, which are none, but in the bounds of what stands around them.
-    is_negative: bool,
+}
+
+/// A pair as it is looked at: what all its pictures share, made once.
+pub(crate) struct Shown<'p> {
+    pair: &'p Pair,
+    scene: Scene<'p>,
+    look: Look,
+    field: Field<'p>,
+}
+
+impl Pair {
+    /// What pictures of it share; `None` if there is nothing to be seen.
+    pub(crate) fn shown(&self) -> Option<Shown<'_>> {
+        let scene = scene_of(&self.channel)?;
+        let look = Look::of_scene(&scene).expect("a look");
+        Some(Shown { pair: self, look, field: Field::new(&self.channel)?, scene })
+    }
+}
+
+impl Shown<'_> {
+    /// Holds paths through the volume to those of the CPU.
+    pub(crate) fn compare_paths(&self, gpu: &Gpu) {
+        let name = format!("{}, {}", self.pair.form, self.pair.subject);
+        compare_on(&name, gpu, &self.pair.volume, &self.scene, PathSettings::default());
+    }
 }
 
 /// A volume in a form; as a surface too, if it is a level set.
-pub fn pairs(gpu: &Gpu, subject: &Subject, form: &Form) -> Vec<Pair> {
+pub(crate) fn pairs(gpu: &Gpu, subject: &Subject, form: &Form) -> Vec<Pair> {
     let fog = pair(gpu, subject, form, false);
     let surface = is_level_set(&subject.grid).then(|| pair(gpu, subject, form, true));
     fog.into_iter().chain(surface.flatten()).collect()
@@ -270,15 +306,14 @@ fn pair(gpu: &Gpu, subject: &Subject, form: &Form, is_surface: bool) -> Option<P
     };
     let level = is_surface.then(|| import_surface(subject.grid.clone()).expect("a linear transform").1);
     let report = import(subject.grid.clone()).expect("a linear transform").1;
-    let is_negative = form.options.is_some() && report.negative_values > 0;
-    let made = |channel, arrays: &Arrays| {
+    let made = |channel, index_offset, arrays: &Arrays| {
         let volume = GpuVolume::new(gpu, arrays).expect("a volume");
-        Pair { subject: subject.name.clone(), form: form.name.clone(), channel, volume, level, is_negative }
+        Pair { subject: subject.name.clone(), form: form.name.clone(), channel, index_offset, volume, level }
     };
     let Some(options) = &form.options else {
         let channel = channel_of(subject.grid.clone());
         let arrays = Arrays::of_channels(&[&channel]).expect("arrays");
-        return Some(made(channel, &arrays));
+        return Some(made(channel, IVec3::ZERO, &arrays));
     };
     let mut grid = subject.grid.clone();
     let band = report.level_set_band;
@@ -296,7 +331,8 @@ fn pair(gpu: &Gpu, subject: &Subject, form: &Form, is_surface: bool) -> Option<P
         Err(GpuError::Unsupported { feature }) if feature.contains("not empty") => return None,
         arrays => arrays.expect("arrays"),
     };
-    Some(made(channel, &arrays))
+    let (channel, index_offset) = in_packed_tree(&asset, &channel, meaning).unwrap_or((channel, IVec3::ZERO));
+    Some(made(channel, index_offset, &arrays))
 }
 
 /// A volume in the light of a sun and an even sky, seen whole.
@@ -316,23 +352,26 @@ fn scene_of(channel: &Channel) -> Option<Scene<'_>> {
 }
 
 /// Holds what a part shows of a volume to what the CPU does.
-pub fn hold(matrix: &mut Matrix, renderer: &mut Renderer, pair: &Pair, part: Part) {
-    let Pair { subject: at, form, channel, volume, level, is_negative } = pair;
+pub(crate) fn hold(matrix: &mut Matrix, renderer: &mut Renderer, shown: &Shown<'_>, part: Part) {
+    let Shown { pair, scene, look, field } = shown;
+    let Pair { subject: at, form, channel, index_offset, volume, level } = pair;
     let is_of_surface = matches!(part, Part::Surface | Part::SurfaceHits);
     if is_of_surface != level.is_some() {
         return;
     }
     let name = format!("{part:?}");
-    if *is_negative && matches!(part, Part::March(_) | Part::Exact(_)) {
-        return matrix.left_out(form, &name, at, "where steps begin hangs on values below 0");
-    }
-    let (Some(scene), Some(field)) = (scene_of(channel), Field::new(channel)) else { return };
-    let look = Look::of_scene(&scene).expect("a look");
     let extinction = scene.volumes[0].extinction[0];
     let level = level.unwrap_or(0.0);
     let few =
         Quality { step_voxels: 1.5, shadow_step_voxels: 4.0, sun_rays: 6, sky_rays: 2, ..Quality::default() };
-    let exact = Quality { shadow_step_voxels: 0.0, sun_rays: 3, sky_rays: 0, ..few };
+    let quality_by = |lookup: Lookup| match lookup {
+        // A step through a whole layer of voxels has its middle on the border of two, where rounding decides which is nearest:
+        // no step is so long.
+        Lookup::Nearest => {
+            Quality { step_voxels: 0.7, shadow_step_voxels: 0.9, shadow_growth: 0.0, lookup, ..few }
+        }
+        lookup => Quality { lookup, ..few },
+    };
     let pass = match part {
         Part::Density => Pass::View(View::Density { extinction }),
         Part::Depth => Pass::View(View::Depth),
@@ -342,11 +381,15 @@ pub fn hold(matrix: &mut Matrix, renderer: &mut Renderer, pair: &Pair, part: Par
         Part::Steps(filter) => Pass::Opacity { filter, step_voxels: 0.5 },
         Part::Surface => Pass::View(View::Surface { level }),
         Part::SurfaceHits => Pass::SurfaceHits { level },
-        Part::March(lookup) if lookup.mean() == lookup => Pass::March(Quality { lookup, ..few }),
+        Part::March(lookup) if lookup.mean() == lookup => Pass::March(quality_by(lookup)),
         Part::March(lookup) => Pass::March(Quality { lookup, samples: 4, ..few }),
-        Part::Exact(lookup) => Pass::March(Quality { lookup, ..exact }),
+        Part::Exact(lookup) => {
+            let by = quality_by(lookup);
+            Pass::March(Quality { shadow_step_voxels: 0.0, sun_rays: 3, sky_rays: 0, ..by })
+        }
     };
-    renderer.prepare(volume, &look, &pass, 0, None).expect("a pass");
+    let start = Instant::now();
+    renderer.prepare(volume, look, &pass, 0, None).expect("a pass");
     renderer.run(volume).expect("a run");
     let ours = match renderer.pixels() {
         Ok(pixels) => pixels,
@@ -355,6 +398,7 @@ pub fn hold(matrix: &mut Matrix, renderer: &mut Renderer, pair: &Pair, part: Par
         }
         Err(error) => panic!("{error}"),
     };
+    let on_device = start.elapsed();
     let rays = (0..PIXELS as u32).map(|i| {
         let pixel = DVec2::new(f64::from(i % SMALL[0]), f64::from(i / SMALL[0])) + 0.5;
         scene.camera.ray(pixel, SMALL[0], SMALL[1])
@@ -364,7 +408,7 @@ pub fn hold(matrix: &mut Matrix, renderer: &mut Renderer, pair: &Pair, part: Par
     match pass {
         Pass::View(view) => {
             let theirs =
-                render_view(&field, view, &scene.camera, SMALL, &|_, _| ()).expect("a picture").pixels;
+                render_view(field, view, &scene.camera, SMALL, &|_, _| ()).expect("a picture").pixels;
             match part {
                 Part::Density | Part::Surface => matrix.colours(form, &name, at, &ours, &theirs),
                 _ => matrix.hits(form, &name, at, &differences(&ours, &theirs), count(&theirs)),
@@ -374,14 +418,16 @@ pub fn hold(matrix: &mut Matrix, renderer: &mut Renderer, pair: &Pair, part: Par
             let theirs: Vec<[f32; 4]> = rays
                 .map(|ray| {
                     let passes =
-                        stepped_transmittance(&field, &mut reader, &ray, filter, step_voxels, extinction);
+                        stepped_transmittance(field, &mut reader, &ray, filter, step_voxels, extinction);
                     [1.0 - passes; 4]
                 })
                 .collect();
             matrix.colours(form, &name, at, &ours, &theirs);
         }
         Pass::Hits { above } => {
-            let expected: Vec<_> = rays.map(|ray| first_voxel(&field, &mut reader, &ray, above)).collect();
+            let in_grid = |hit: VoxelHit| VoxelHit { voxel: hit.voxel + *index_offset, ..hit };
+            let expected: Vec<_> =
+                rays.map(|ray| first_voxel(field, &mut reader, &ray, above).map(in_grid)).collect();
             let errors: Vec<f64> = ours
                 .iter()
                 .zip(&expected)
@@ -390,7 +436,7 @@ pub fn hold(matrix: &mut Matrix, renderer: &mut Renderer, pair: &Pair, part: Par
             matrix.hits(form, &name, at, &errors, expected.iter().flatten().count());
         }
         Pass::SurfaceHits { level } => {
-            let expected: Vec<_> = rays.map(|ray| first_hit(&field, &mut reader, &ray, level)).collect();
+            let expected: Vec<_> = rays.map(|ray| first_hit(field, &mut reader, &ray, level)).collect();
             let voxel = channel.world_from_index.matrix3.x_axis.length();
             let is_same = |(hit, expected): (&[f32; 4], &Option<SurfaceHit>)| {
                 expected.map_or(hit[0] < 0.0, |expected| {
@@ -402,7 +448,7 @@ pub fn hold(matrix: &mut Matrix, renderer: &mut Renderer, pair: &Pair, part: Par
             matrix.hits(form, &name, at, &errors, expected.iter().flatten().count());
         }
         Pass::March(quality) => {
-            let picture = nuage_render::picture::render(&scene, quality, SMALL[0], SMALL[1], &|_, _| ());
+            let picture = nuage_render::picture::render(scene, quality, SMALL[0], SMALL[1], &|_, _| ());
             let theirs = picture.expect("a picture").pixels;
             match quality.samples {
                 1 => matrix.colours(form, &name, at, &ours, &theirs),
@@ -411,6 +457,9 @@ pub fn hold(matrix: &mut Matrix, renderer: &mut Renderer, pair: &Pair, part: Par
         }
         _ => {}
     }
+    let tally = matrix.tally(form, &name);
+    tally.seconds[0] += on_device.as_secs_f64();
+    tally.seconds[1] += (start.elapsed() - on_device).as_secs_f64();
 }
 
 /// By how many standard errors the means of two pictures differ at most. Which voxel is chosen hangs on the last bits of distances,
