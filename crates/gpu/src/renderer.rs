@@ -139,7 +139,7 @@ impl Renderer {
             params,
             picture,
             band: None,
-            share: Share::default(),
+            share: Share::of(size[0].saturating_mul(size[1])),
             groups,
             depth_layout,
             depth: None,

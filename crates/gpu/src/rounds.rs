@@ -31,10 +31,17 @@ pub(crate) struct Share {
     pub(crate) look_ups: u32,
 }
 
-impl Default for Share {
-    fn default() -> Self {
-        // Eight pixels that share their loops, as in lavapipe, may take no turn together; and most pictures are to be done at once.
-        Share { rays: 128, look_ups: 4096 }
+/// The look-ups of a pixel in a dispatch that goes on. Eight pixels that share their loops, as in lavapipe, may take no turn together.
+const LOOK_UPS: u32 = 4096;
+/// The shadow rays of a picture's first dispatch, if all pixels take as many.
+const FIRST_RAYS: u32 = 1 << 28;
+/// The fewest of a pixel: most pictures are to be done at once, however many pixels they have.
+const FEWEST_RAYS: u32 = 128;
+
+impl Share {
+    /// What is done at once of a picture of so many pixels.
+    pub(crate) fn of(pixels: u32) -> Self {
+        Share { rays: (FIRST_RAYS / pixels.max(1)).max(FEWEST_RAYS), look_ups: LOOK_UPS }
     }
 }
 
@@ -203,7 +210,7 @@ mod tests {
             }
             pixels
         };
-        let expected = mean(u32::MAX, Share::default().look_ups);
+        let expected = mean(u32::MAX, LOOK_UPS);
         assert!(expected.iter().filter(|pixel| pixel[0] > 0.0).count() > 20, "little is seen");
         assert!(mean(3, 2000) == expected, "shares show");
         if gpu.name().contains("llvmpipe") {
