@@ -3,7 +3,7 @@
 //!
 //! The words are those of `nuage_volume`'s builder and packer over `nuage_pipeline::import`, entry for entry, but that equal
 //! masks and nodes are not shared: bricks of one value become tiles, those of zeros vanish, what touches a value has an entry,
-//! and bounds are those of trilinear footprints. Maps of bricks, where they are worth it, are those of [`crate::maps`]. Room for
+//! and bounds are those of trilinear footprints. Maps of bricks, where they are worth it, are those of `maps`. Room for
 //! the largest tree of an array's size is taken once; building again allocates nothing, and is the same work each time.
 //!
 //! What does not live here: how a volume is drawn ([`crate::renderer`]), and trees from files ([`crate::arrays`]).
