@@ -18,11 +18,11 @@ use nuage_render::hash::{hash_pixel, hash_u32, unit_f32};
 use nuage_render::packet::{
     RAYS, Surface, first_collisions, first_voxels, optical_depths, stepped_transmittances,
 };
+use nuage_render::picture::each_tile;
 use nuage_render::tiling::Tiling;
 use nuage_render::traverse::{Field, Reader};
 use nuage_testkit::clock::processor_ms;
 use nuage_volume::channel::Channel;
-use rayon::prelude::*;
 
 /// Per voxel at density 1.
 const EXTINCTION_PER_VOXEL: f64 = 0.1;
@@ -47,11 +47,12 @@ fn picture<'a>(
     tiles: &mut [Vec<[f32; RAYS]>],
 ) -> f64 {
     let begin = Instant::now();
-    tiles.par_iter_mut().enumerate().for_each_init(
+    each_tile(
+        tiles,
         || field.reader(),
-        |reader, (tile, values)| {
+        |reader, tile, values: &mut Vec<[f32; RAYS]>| {
             values.clear();
-            values.extend(tiling.squares(tile as u32).map(|pixels| kernel(reader, pixels)));
+            values.extend(tiling.squares(tile).map(|pixels| kernel(reader, pixels)));
         },
     );
     begin.elapsed().as_secs_f64() * 1e3

@@ -89,17 +89,36 @@ pub(crate) fn each_packet<W>(
     all
 }
 
-/// Does some work on every tile, on all cores. Each thread has a worker of its own.
-pub(crate) fn each_tile<W, T: Send>(
+/// Does some work on every tile, by the threads of the pool this is called in. Each thread has a worker of its own, and takes the
+/// next tiles in order whenever it has none.
+pub fn each_tile<W, T: Send>(
     tiles: &mut [T],
     worker: impl Fn() -> W + Sync + Send,
     work: impl Fn(&mut W, u32, &mut T) + Sync + Send,
 ) {
     #[cfg(feature = "parallel")]
     {
-        use rayon::prelude::*;
-        let tiles = tiles.par_iter_mut().enumerate();
-        tiles.for_each_init(worker, |worker, (index, tile)| work(worker, index as u32, tile));
+        use std::sync::{Mutex, PoisonError};
+
+        // Neighbours that a thread takes at once, so that it finds what their rays read in its own cache; and how often each takes
+        // some at least, so that none waits long for another at the end.
+        const MOST_TOGETHER: usize = 16;
+        const LEAST_TURNS: usize = 16;
+        let threads = rayon::current_num_threads();
+        let together = (tiles.len() / (threads * LEAST_TURNS)).clamp(1, MOST_TOGETHER);
+        let left = Mutex::new((0..).step_by(together).zip(tiles.chunks_mut(together)));
+        let take = || left.lock().unwrap_or_else(PoisonError::into_inner).next();
+        rayon::scope(|scope| {
+            for _ in 0..threads {
+                scope.spawn(|_| {
+                    let mut own = None;
+                    while let Some((first, tiles)) = take() {
+                        let own = own.get_or_insert_with(&worker);
+                        (first..).zip(tiles).for_each(|(index, tile)| work(own, index, tile));
+                    }
+                });
+            }
+        });
     }
     #[cfg(not(feature = "parallel"))]
     {
