@@ -428,6 +428,16 @@ impl Renderer {
     /// # Errors
     /// If nothing was prepared.
     pub fn record(&mut self, encoder: &mut wgpu::CommandEncoder, volume: &Volume) -> Result<(), GpuError> {
+        self.record_share(encoder, volume, u32::MAX)
+    }
+
+    /// Records what was prepared, of which a pixel is left unfinished behind so many shadow rays or scatterings.
+    fn record_share(
+        &mut self,
+        encoder: &mut wgpu::CommandEncoder,
+        volume: &Volume,
+        rays: u32,
+    ) -> Result<(), GpuError> {
         let nothing = || GpuError::Misuse("nothing was prepared to be recorded".to_owned());
         let Prepared { key: (source, features), is_first, .. } =
             *self.prepared.as_ref().ok_or_else(nothing)?;
@@ -437,17 +447,12 @@ impl Renderer {
         } else if goes_on(source, &features) {
             encoder.clear_buffer(&self.picture, self.pixel_bytes(), None);
         }
-        self.current.rounds = [0, 0, 0, u32::MAX];
-        self.write_params()?;
-        let real_time = self.stages.as_mut().filter(|_| features.is_real_time);
-        let sources = match real_time {
-            Some(stages) => {
-                let sources = stages.advance(&mut self.current, volume, &features);
-                self.write_params()?;
-                sources
-            }
+        self.current.rounds = [0, 0, 0, rays];
+        let sources = match self.stages.as_mut().filter(|_| features.is_real_time) {
+            Some(stages) => stages.advance(&mut self.current, volume, &features),
             None => vec![source],
         };
+        self.write_params()?;
         let [(_, to_picture), _] = &self.groups;
         let stages = self.stages.as_ref().filter(|_| features.is_real_time);
         let timer = stages.and_then(Stages::timer);
@@ -674,13 +679,11 @@ impl Renderer {
     /// If nothing was prepared, or as [`Renderer::finish`].
     pub fn run(&mut self, volume: &Volume) -> Result<(), GpuError> {
         let mut encoder = self.encoder();
-        self.record(&mut encoder, volume)?;
-        if let Some(Prepared { key: (source, features), .. }) = &self.prepared
-            && goes_on(*source, features)
-        {
-            self.current.rounds[3] = self.share.rays;
-            self.write_params()?;
-        }
+        let rays = match &self.prepared {
+            Some(Prepared { key: (source, features), .. }) if goes_on(*source, features) => self.share.rays,
+            _ => u32::MAX,
+        };
+        self.record_share(&mut encoder, volume, rays)?;
         let start = Instant::now();
         self.gpu.guarded(|| self.gpu.queue().submit([encoder.finish()]))?;
         self.gpu.wait()?;
